@@ -142,10 +142,8 @@ class Fork:
         found: dict[str, tuple[str, ...]] = {}
         for name in graphdeco.drawing_functions(self.repo, RENDERER):
             for call in graphdeco.read_calls(self.repo, RENDERER, name):
-                found.setdefault(call.call.package, call.settings)
-        return found | {
-            call.call.package: call.settings for draw in self.draws for call in draw.calls
-        }
+                found.setdefault(call.package, call.settings)
+        return found | {call.package: call.settings for draw in self.draws for call in draw.calls}
 
     # -- modules ----------------------------------------------------------------------------------
 
@@ -583,15 +581,15 @@ def _needs_option(fork: Fork, test: ast.expr) -> bool:
 def _check_call(fork: Fork, at: str, function: str, call: graphdeco.CallInSource) -> None:
     """Settings and arguments besides the known ones: off, or without a part in the picture."""
     if blended := blended_argument(fork.repo, call):
-        fork.blended[call.call.package] = blended
-    screens = frozenset(filter(_SCREEN.fullmatch, call.call.arguments))
+        fork.blended[call.package] = blended
+    screens = frozenset(filter(_SCREEN.fullmatch, call.arguments))
     fork.screens |= screens
-    given = call.call.arguments - SERVED - screens - {blended}
-    further = [*(call.call.besides - NEUTRAL), *given]
+    given = call.arguments - SERVED - screens - {blended}
+    further = [*(call.besides - NEUTRAL), *given]
     unknown = {each for each in further if not _stays_off(fork, function, call.given.get(each))}
     fork.off |= {*further} - unknown
-    for name in sorted(unknown & call.call.besides):
-        changed = changed_gradients(fork.repo, call.call.package, name)
+    for name in sorted(unknown & call.besides):
+        changed = changed_gradients(fork.repo, call.package, name)
         if changed is not None and changed <= {"means2D"}:
             unknown.remove(name)
             fork.scaled |= {name}
@@ -634,7 +632,7 @@ def _read_outputs(fork: Fork) -> None:
     """What each rasterizer returns; refused where a value is read and its meaning is unknown."""
     for draw in fork.draws:
         for call in draw.calls:
-            package = call.call.package
+            package = call.package
             roles = tuple(_output(fork, draw, call, number) for number in range(len(call.names)))
             known = fork.outputs.get(package)
             if known is not None and len(known) != len(roles):
@@ -659,7 +657,7 @@ def _read_outputs(fork: Fork) -> None:
 
 
 def _output(fork: Fork, draw: Draw, call: graphdeco.CallInSource, number: int) -> Output:
-    name, package = call.names[number], call.call.package
+    name, package = call.names[number], call.package
     if number == 0:
         return Output(name, "image")
     if "radii" in name:

@@ -58,9 +58,9 @@ class Output:
 def meaning(repo: HostRepo, call: graphdeco.CallInSource, name: str) -> Output:
     """What a further value is, by its name and by the vendored kernel that makes it."""
     late = "antialiasing" in call.settings and len(call.names) == 3
-    if late and call.call.package == "diff_gaussian_rasterization":
+    if late and call.package == "diff_gaussian_rasterization":
         return Output(name, "invdepth")  # the rasterizer since August 2024
-    text = "".join(graphdeco.normal_sources(repo, call.call.package))
+    text = "".join(graphdeco.normal_sources(repo, call.package))
     if role := _sum_for_gaussians(text, name):
         made = re.search(rf"{name}=torch::\w+\(\{{\w+(,1)?\}}[^;]*;", text)
         whole = made is not None and "kInt" in made[0]
@@ -89,8 +89,8 @@ def blended_argument(repo: HostRepo, call: graphdeco.CallInSource) -> str:
 
     "" if there is none, or if several could be it.
     """
-    further = sorted(call.call.arguments - {"dc"})
-    text = "".join(graphdeco.normal_sources(repo, call.call.package))
+    further = sorted(call.arguments - {"dc"})
+    text = "".join(graphdeco.normal_sources(repo, call.package))
     return further[0] if len(further) == 1 and _blended(text) else ""
 
 

@@ -291,8 +291,8 @@ class GraphdecoAdapter(ScriptAdapter):
             expected = [str(each) for each in accepted if each.function == name]
             calls = read_calls(repo, renderer, name)
             for each in calls:
-                own = each.call.package == self.package
-                call = replace(each.call, package="") if own else each.call
+                own = each.package == self.package
+                call = replace(each, package="") if own else each
                 if not any(known.answers(call) for known in accepted):
                     found.append((name, repo.at(renderer, each.line), str(call), expected))
             if not calls:
@@ -329,7 +329,7 @@ class GraphdecoAdapter(ScriptAdapter):
         return self.dialect_type(
             package=self.package,
             settings=call.settings if call else (),
-            outputs=(call.call.outputs if call else None) or 2,
+            outputs=(call.outputs if call else None) or 2,
             sparse_adam=bool(repo.mentions(["train"], ["SparseGaussianAdam"]))
             or bool(repo.mentions([MODEL], ["SparseGaussianAdam"])),
         )
@@ -537,9 +537,7 @@ def resolution(repo: HostRepo, asked: int | None) -> Resolution:
             f"a divisor, a width, or -1: at most {WIDEST} pixels wide, as vanilla has it",
             "Measure with fragprune compare --resolution, or with the host's own metrics.py.",
         )
-    if value in divisors:
-        return Resolution(divide=value)
-    return Resolution(width=WIDEST if value == -1 else value, shrink_only=value == -1)
+    return Resolution.asked(value, divisors)
 
 
 def default(repo: HostRepo, name: str, otherwise: float) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from fragprune_plugins.adapting import Function, HostRepo, nodes
 
@@ -43,8 +43,10 @@ class RasterizerCall:
 
     def answers(self, found: RasterizerCall) -> bool:
         """Whether a dialect for this call can answer the call found in a source."""
-        passed = replace(found, arguments=self.arguments)
-        return found.arguments <= self.arguments and passed == self
+        ours, theirs = (
+            (each.besides, each.outputs, each.function, each.package) for each in (self, found)
+        )
+        return ours == theirs and found.arguments <= self.arguments
 
     def __str__(self) -> str:
         more = ", ".join(sorted(self.besides | self.arguments))
@@ -55,11 +57,10 @@ class RasterizerCall:
 
 
 @dataclass(frozen=True)
-class CallInSource:
-    """A rasterizer call, with its place in the source.
+class CallInSource(RasterizerCall):
+    """A rasterizer call, with its place in the source and its package filled in.
 
     Attributes:
-        call: the call, with its package filled in.
         settings: names of the settings, in order.
         line: where its result is assigned.
         names: of the unpacked values, in order; "" where one is no plain name. Empty if the result
@@ -67,9 +68,8 @@ class CallInSource:
         given: arguments and settings by name.
     """
 
-    call: RasterizerCall
-    settings: tuple[str, ...]
-    line: int
+    settings: tuple[str, ...] = ()
+    line: int = 0
     names: tuple[str, ...] = ()
     given: Mapping[str, ast.expr] = field(default_factory=dict, compare=False)
 
@@ -106,18 +106,20 @@ def read_calls(repo: HostRepo, module: str, function: str) -> list[CallInSource]
     names = _settings(made[0]) if made else {}  # type: ignore[arg-type]
     if not names:
         return []
-    besides = frozenset(names) - set(SHARED)
-    drawn = sorted(_drawn(imported, body), key=lambda each: each[1])
+    drawn = list(_drawn(imported, body)) or [(body.lineno, imported.package(made[0]), (), {})]
     return [
         CallInSource(
-            RasterizerCall(besides, outputs, function, frozenset(given) - set(ARGUMENTS), package),
+            frozenset(names) - set(SHARED),
+            len(unpacked) or None,
+            function,
+            frozenset(given) - set(ARGUMENTS),
+            package,
             tuple(names),
             line,
             unpacked,
             given | names,
         )
-        for outputs, line, given, package, unpacked in drawn
-        or [(None, body.lineno, {}, imported.package(made[0]), ())]
+        for line, package, unpacked, given in sorted(drawn, key=lambda each: each[0])
     ]
 
 
@@ -128,11 +130,10 @@ def _settings(made: ast.Call) -> dict[str, ast.expr]:
     return dict(zip(unnamed, made.args, strict=True)) | named
 
 
-_Drawn = tuple[int | None, int, dict[str, ast.expr], str, tuple[str, ...]]
-
-
-def _drawn(imported: _Imported, body: Function) -> Iterator[_Drawn]:
-    """Values unpacked, line, arguments, package and names of every call of the rasterizer."""
+def _drawn(
+    imported: _Imported, body: Function
+) -> Iterator[tuple[int, str, tuple[str, ...], dict[str, ast.expr]]]:
+    """Line, package, names of the values and arguments of every call of the rasterizer."""
     assigned = [node for node in nodes(body) if isinstance(node, ast.Assign)]
     targets = {id(node.value): node.targets[0] for node in assigned}
     rasterizers = {
@@ -149,11 +150,10 @@ def _drawn(imported: _Imported, body: Function) -> Iterator[_Drawn]:
             target = targets.get(id(node), node)
             values = target.elts if isinstance(target, ast.Tuple) else []
             yield (
-                len(values) or None,
                 target.lineno,
-                {each.arg: each.value for each in node.keywords if each.arg},
                 imported.package(called) if own else rasterizers[called.id],  # type: ignore[attr-defined]
                 tuple(getattr(each, "id", "") for each in values),
+                {each.arg: each.value for each in node.keywords if each.arg},
             )
 
 

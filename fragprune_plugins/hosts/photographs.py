@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,13 @@ class Resolution:
             if not number and not (name == "width" and value is None):
                 remedy = "Check the resolution."
                 raise InputError(f"Resolution.{name}", repr(value)[:80], f"1 to {most}", remedy)
+
+    @classmethod
+    def asked(cls, value: int, divisors: Collection[int]) -> Resolution:
+        """The size for a host's ``-r``: a divisor, a width, or -1: at most ``WIDEST`` wide."""
+        if value in divisors:
+            return cls(divide=value)
+        return cls(width=WIDEST if value < 1 else value, shrink_only=value < 1)
 
     def of(self, width: int, height: int) -> tuple[int, int]:
         """The size at which an image of this size is read, at least one pixel a side.

@@ -48,6 +48,6 @@ def renderer(request, tmp_path):
 def test_a_rasterizer_is_read_however_it_is_spelled(renderer):
     assert drawing_functions(renderer, RENDERER) == ["render"]
     (found,) = read_calls(renderer, RENDERER, "render")
-    assert (found.call.package, found.settings) == ("a_rasterizer", tuple(SETTINGS))
+    assert (found.package, found.settings) == ("a_rasterizer", tuple(SETTINGS))
     assert found.names == ("image", "radii", "depth")
     assert set(found.given) == {"means3D", "means2D", "opacities", *SETTINGS}

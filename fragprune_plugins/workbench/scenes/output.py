@@ -14,7 +14,7 @@ from typing import Any
 
 from fragprune_plugins.errors import DatasetError, ModelFileError, printable
 from fragprune_plugins.files.reading import MEBIBYTE, Door
-from fragprune_plugins.hosts.photographs import WIDEST, Photographs, Resolution
+from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.hosts.source import parsed
 
 ARGUMENTS, CAMERAS = "cfg_args", "cameras.json"
@@ -85,7 +85,7 @@ def trained_on(model: Path) -> Photographs | None:
         reading.place = ""
         photographs = Photographs(
             Path(str(values["source_path"])),
-            _resolution(int(values.get("resolution", -1))),
+            Resolution.asked(int(values.get("resolution", -1)), _DIVISORS),
             bool(values.get("white_background", False)),
             str(values.get("images", "images")),
         )
@@ -105,9 +105,3 @@ def _call(text: str) -> ast.Call:
         case [ast.Expr(value=ast.Call(func=ast.Name(id="Namespace")) as call)]:
             return call
     raise ValueError("no Namespace(...)")
-
-
-def _resolution(asked: int) -> Resolution:
-    if asked in _DIVISORS:
-        return Resolution(divide=asked)
-    return Resolution(width=WIDEST if asked < 1 else asked, shrink_only=asked < 1)
