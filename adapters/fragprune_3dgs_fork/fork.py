@@ -206,11 +206,8 @@ def _imported(repo: HostRepo, modules: Iterable[str]) -> dict[str, None]:
             continue
         seen[module] = None
         for node in nodes(tree):
-            if isinstance(node, ast.Import):
-                waiting += [each.name for each in node.names]
-            elif isinstance(node, ast.ImportFrom):
-                base = repo.absolute(module, node)
-                waiting += [base, *(f"{base}.{each.name}" for each in node.names)]
+            if isinstance(node, ast.Import | ast.ImportFrom):
+                waiting += repo.imported_by(module, node)
     return seen
 
 

@@ -330,8 +330,7 @@ class GraphdecoAdapter(ScriptAdapter):
             package=self.package,
             settings=call.settings if call else (),
             outputs=(call.outputs if call else None) or 2,
-            sparse_adam=bool(repo.mentions(["train"], ["SparseGaussianAdam"]))
-            or bool(repo.mentions([MODEL], ["SparseGaussianAdam"])),
+            sparse_adam=bool(repo.mentions(["train", MODEL], ["SparseGaussianAdam"])),
         )
 
     def scripts_of(self, repo: HostRepo) -> tuple[str, ...]:

@@ -122,7 +122,7 @@ def _foreign(repo: HostRepo, script: Path, provided: Collection[str]) -> Iterato
         seen.add(path)
         tree = root.tree(name)
         for node in _imports(tree.body if tree else [], main=module == begin):
-            for wanted in _names(node, root, name):
+            for wanted in root.imported_by(name, node):
                 if any(wanted == each or wanted.startswith(f"{each}.") for each in provided):
                     continue
                 own = _own(roots, wanted)
@@ -150,14 +150,6 @@ def _is_main(node: ast.stmt) -> TypeGuard[ast.If]:
             for side in (node.test.left, *node.test.comparators)
         )
     )
-
-
-def _names(node: ast.Import | ast.ImportFrom, repo: HostRepo, module: str) -> list[str]:
-    """Dotted names that a statement may import; a name taken from a module may be a module too."""
-    if isinstance(node, ast.Import):
-        return [alias.name for alias in node.names]
-    base = repo.absolute(module, node)
-    return [base, *(f"{base}.{alias.name}" for alias in node.names)]
 
 
 def _own(roots: list[HostRepo], name: str) -> list[Module]:

@@ -207,6 +207,13 @@ class HostRepo:
         parts = module.split(".")
         return ".".join([*parts[: len(parts) - up], *([node.module] if node.module else [])])
 
+    def imported_by(self, module: str, node: ast.Import | ast.ImportFrom) -> list[str]:
+        """Dotted names that a statement may import; what it takes from a module may be one, too."""
+        if isinstance(node, ast.Import):
+            return [alias.name for alias in node.names]
+        base = self.absolute(module, node)
+        return [base, *(f"{base}.{alias.name}" for alias in node.names)]
+
     def mentions(self, modules: Iterable[str], names: Iterable[str]) -> dict[str, str]:
         """Which of the names occur as identifiers, attributes or parameters, and where."""
         wanted = set(names)
