@@ -138,58 +138,58 @@ def choose(
             "--adapter", repr(name), f"one of {', '.join(sorted(by_name)) or 'none'}", "Choose one."
         )
     wanted = [by_name[name.replace("_", "-")]] if name else list(adapters)
-    matches = [(adapter, adapter.match(repo)) for adapter in wanted]
-    fitting = closest([adapter for adapter, match in matches if match.fits], adapters)
+    tried = attempt(repo, wanted)
+    fitting = closest(tried, adapters)
     if len(fitting) == 1:
-        return fitting[0]
+        return fitting[0].adapter
     if not fitting:
         others = [a.name for a in adapters if a not in wanted and a.match(repo).fits]
         raise UnknownHostError(
             str(repo.root),
-            f"no adapter fits ({_nearest(repo, wanted)})",
+            f"no adapter fits ({_nearest(tried)})",
             "a codebase that an installed adapter knows",
             f"Choose {' or '.join(others)}, which fits."
             if others
             else "Run fragprune check on the folder to see more, or write an adapter.",
         )
-    tied = [match for adapter, match in matches if adapter in fitting]
-    selected = select(repo=repo, matches=tied) if select else None
-    for adapter in fitting:
-        if adapter.name == selected:
-            return adapter
+    selected = select(repo=repo, matches=[each.match for each in fitting]) if select else None
+    for each in fitting:
+        if each.adapter.name == selected:
+            return each.adapter
     raise UnknownHostError(
         str(repo.root),
-        f"several adapters fit: {', '.join(a.name for a in fitting)}",
+        f"several adapters fit: {', '.join(each.adapter.name for each in fitting)}",
         "one",
         "Name it with --adapter.",
     )
 
 
-def _nearest(repo: HostRepo, adapters: Sequence[HostAdapter]) -> str:
-    """The errors of the adapter that comes nearest."""
-    if not adapters:
+def _nearest(tried: Sequence[Tried]) -> str:
+    """The errors of the adapter that comes nearest, the first."""
+    if not tried:
         return "none is installed"
-    best = attempt(repo, adapters)[0]
-    if len(adapters) == 1:
+    best = tried[0]
+    if len(tried) == 1:
         return f"{best.adapter.name}: {'; '.join(map(str, best.errors[:1]))}"
     return f"the nearest, {best.brief()}" if best.held else "none finds anything of its host"
 
 
-def closest(fitting: Sequence[HostAdapter], adapters: Sequence[HostAdapter]) -> list[HostAdapter]:
-    """The fitting adapters without those that are ancestors of another fitting one.
+def closest(tried: Sequence[Tried], adapters: Sequence[HostAdapter]) -> list[Tried]:
+    """The adapters that fit, without those that are ancestors of another one.
 
     Args:
-        fitting: adapters that fit a checkout.
+        tried: results of adapters on a checkout.
         adapters: all adapters, to find ancestors of ancestors.
     """
+    fitting = [each for each in tried if each.match.fits]
     parents = {adapter.name: adapter.descends_from for adapter in adapters}
     ancestors: set[str] = set()
-    for adapter in fitting:
-        new = set(adapter.descends_from)
+    for each in fitting:
+        new = set(each.adapter.descends_from)
         while new := new - ancestors:
             ancestors |= new
-            new = {name for each in new for name in parents.get(each, ())}
-    return [adapter for adapter in fitting if adapter.name not in ancestors] or list(fitting)
+            new = {name for one in new for name in parents.get(one, ())}
+    return [each for each in fitting if each.adapter.name not in ancestors] or fitting
 
 
 def usage(adapter: HostAdapter, repo: HostRepo) -> str:

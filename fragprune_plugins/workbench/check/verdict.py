@@ -64,8 +64,7 @@ def judge(
         adapters: all adapters.
         plugins: tell which models it saves, where no adapter fits.
     """
-    nearer = closest([each.adapter for each in tried if each.match.fits], adapters)
-    fitting = [each for each in tried if each.adapter in nearer]
+    fitting = closest(tried, adapters)
     if len(fitting) == 1:
         unproved = _unproved(repo, fitting[0])
         name = fitting[0].adapter.name
@@ -164,6 +163,5 @@ def _inside(
     found = []
     for each in others:
         tried = attempt(HostRepo(repo.root / each.folder), adapters)
-        nearer = closest([one.adapter for one in tried if one.match.fits], adapters)
-        found += [(each.folder, adapter.name) for adapter in nearer[:1]]
+        found += [(each.folder, one.adapter.name) for one in closest(tried, adapters)[:1]]
     return tuple(found)

@@ -50,8 +50,7 @@ def _single(
     """Everything about one checkout; the exit code is 0 if one adapter fits."""
     repo = _repository(host, adapters, adapter)
     tried = attempt(repo, adapters)
-    closer = closest([each.adapter for each in tried if each.match.fits], adapters)
-    fitting = [each for each in tried if each.adapter in closer]
+    fitting = closest(tried, adapters)
     verdict = fitting[0] if len(fitting) == 1 else None
     judged = judge(repo, tried, adapters, plugins)
     kept = _kept(repo, verdict.adapter.dialect(repo)) if verdict else []
