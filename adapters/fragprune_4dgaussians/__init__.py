@@ -21,11 +21,9 @@ import fragprune_graphdeco as graphdeco
 from fragprune_4dgaussians.config import PythonFile
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.adapting import (
-    CommandLine,
     Door,
     HostCall,
     HostInfo,
-    HostRepo,
     ModelFileError,
     ParamGroup,
     RasterInputs,
@@ -42,9 +40,6 @@ OUTPUTS = 3
 STATE = 12
 """The place of the optimizer's state in a checkpoint."""
 
-UNUSED = {"open3d": {}, "lpips": {}, "tkinter": {"W": "w"}}
-"""What it imports and does not use to train or draw; W by name."""
-
 _NETWORK = Door(
     ModelFileError,
     "not readable as a part of the model",
@@ -57,7 +52,7 @@ _NETWORK = Door(
 class MovingDialect(GraphdecoDialect):
     """Vanilla's call of 2023 with depth."""
 
-    spares = UNUSED
+    spares = {"open3d": {}, "lpips": {}, "tkinter": {"W": "w"}}  # not used to train or draw
     returned = ("image", "radii", "depth")
 
     def unpack(self, call: HostCall) -> RasterInputs:
@@ -119,6 +114,11 @@ class MovingGaussians(GraphdecoAdapter):
         "the host's metrics.py measures the pictures.",
     )
     steps_by_rendering = True
+    flags = {
+        "config": PythonFile("--configs"),
+        "made": ".fragprune_fine_{}.pth",
+        "hold_out": (),
+    }
     checkpoints = "chkpnt_fine_"
     seams = (
         *revised(
@@ -134,15 +134,6 @@ class MovingGaussians(GraphdecoAdapter):
     )
 
     # -- its command line ------------------------------------------------------------------------
-
-    def command_line(self, repo: HostRepo) -> CommandLine:
-        """The flags, and a Python file that overrides them."""
-        return replace(
-            super().command_line(repo),
-            config=PythonFile("--configs"),
-            made=".fragprune_fine_{}.pth",
-            hold_out=(),
-        )
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
         """The same command, with the output folder that ``--expname`` means.

@@ -5,10 +5,10 @@ from __future__ import annotations
 import ast
 import contextlib
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from fragprune_graphdeco.call import RasterizerCall, drawing_functions, read_calls
@@ -223,6 +223,7 @@ class GraphdecoAdapter(ScriptAdapter):
         own_names: "module:name" of names that only this host's source mentions, not its ancestors'.
         scripts: paths of training scripts in the checkout, the usual one first.
         optimizer: the host's, by its name in ``torch.optim``.
+        flags: fields of ``CommandLine`` that differ from those of vanilla.
         checkpoints: how names of checkpoints begin, before the iteration; a regular expression.
         densifies_until: arguments with the iterations after which the host adds, relocates, prunes
             and resets no Gaussian; () if it does so to its end.
@@ -241,6 +242,7 @@ class GraphdecoAdapter(ScriptAdapter):
     densifies_until: tuple[str, ...] = ("densify_until_iter",)
     filtered = False
     undrawn: tuple[str, ...] = ()
+    flags: ClassVar[Mapping[str, Any]] = MappingProxyType({})
     checkpoints = "chkpnt"
     seams = (
         *MODEL_SEAMS,
@@ -346,7 +348,7 @@ class GraphdecoAdapter(ScriptAdapter):
 
         The last iteration takes no step.
         """
-        return CommandLine(
+        line = CommandLine(
             scripts=self.scripts_of(repo),
             iterations="--iterations",
             output=("-m", "--model_path"),
@@ -360,6 +362,7 @@ class GraphdecoAdapter(ScriptAdapter):
             white_background=("-w", "--white_background"),
             hold_out=("--eval",),
         )
+        return replace(line, **self.flags)
 
     def densified(self, repo: HostRepo, script: Path, arguments: list[str]) -> int | None:
         """The latest of those of ``densifies_until`` that the source has, with its defaults."""

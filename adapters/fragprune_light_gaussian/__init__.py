@@ -8,13 +8,12 @@ thresholds they count only fragments that remain after truncation, as in the sho
 from __future__ import annotations
 
 from argparse import ArgumentParser
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.adapting import (
-    CommandLine,
     HostCall,
     HostInfo,
     HostRepo,
@@ -67,6 +66,7 @@ class LightGaussian(GraphdecoAdapter):
     )
     dialect_type = LightGaussianDialect
     scripts = (TRAIN, PRUNE, DISTIL)
+    flags = {"continues": (PRUNE, DISTIL)}
     optimizer = "AdamW"
     densifies_until = ("densify_until_iter", "prune_iterations")
     seams = (
@@ -77,10 +77,6 @@ class LightGaussian(GraphdecoAdapter):
         Seam(Role.STILL, MODEL, "GaussianModel.densify"),
         Seam(Role.LOAD, MODEL, "GaussianModel.load_ply_sh", ("path",)),
     )
-
-    def command_line(self, repo: HostRepo) -> CommandLine:
-        """The flags; the pruning and distillation scripts start from a checkpoint."""
-        return replace(super().command_line(repo), continues=(PRUNE, DISTIL))
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
         """The command for stage 2. Distillation cannot resume: it would remove another SH band."""

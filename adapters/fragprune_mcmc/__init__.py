@@ -9,18 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.adapting import (
     AlignmentError,
-    CommandLine,
     ConfigFile,
     HostCall,
     HostInfo,
-    HostRepo,
     Role,
     RowTrace,
     Seam,
@@ -114,6 +112,7 @@ class MCMC(GraphdecoAdapter):
     calls = (RasterizerCall(outputs=3),)
     own_names = ("utils.reloc_utils:compute_relocation",)
     dialect_type = MCMCDialect
+    flags = {"config": ConfigFile("--config")}  # its values override the others
     seams = (
         *revised(GraphdecoAdapter.seams, {"GaussianModel.update_learning_rate": {"how": no_noise}}),
         Seam(
@@ -121,7 +120,3 @@ class MCMC(GraphdecoAdapter):
         ),
         Seam(Role.REARRANGE, MODEL, "GaussianModel.add_new_gs", ("cap_max",), how=following_copies),
     )
-
-    def command_line(self, repo: HostRepo) -> CommandLine:
-        """Vanilla's flags, and a configuration file whose values override them."""
-        return replace(super().command_line(repo), config=ConfigFile("--config"))

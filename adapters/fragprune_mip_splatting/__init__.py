@@ -33,15 +33,12 @@ if TYPE_CHECKING:
 MODEL = "scene.gaussian_model"
 KERNEL_SIZE = 0.1
 
-UNUSED: dict[str, dict[str, str]] = {"open3d": {}, "cv2": {}}
-"""What it imports and never uses."""
-
 
 @dataclass(frozen=True)
 class MipDialect(GraphdecoDialect):
     """Vanilla's call of 2023 with the 2D filter's size and a sampling offset for each pixel."""
 
-    spares = UNUSED
+    spares = {"open3d": {}, "cv2": {}}  # imported and never used
 
     def unpack(self, call: HostCall) -> RasterInputs:
         """Translate the call; densification reads an absolute third column of the gradient."""

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 import fragprune_graphdeco as graphdeco
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.adapting import (
-    CommandLine,
     HostCall,
     HostInfo,
     HostRepo,
@@ -33,9 +32,6 @@ MODEL = "scene.gaussian_model"
 PACKAGE = "submodules.diff_gaussian_rasterization.diff_gaussian_rasterization"
 """Inside the checkout, and compiled when it is imported."""
 
-UNUSED: dict[str, dict[str, str]] = {"wandb": {}}
-"""What it imports and never uses."""
-
 WARM_UP = 10_000
 """Iterations that ``--ours_new`` warms up."""
 
@@ -52,7 +48,7 @@ class RainDialect(GraphdecoDialect):
     """Vanilla's call of 2023 with a dilation of its own, and depth."""
 
     own_kernels = "compiler"
-    spares = UNUSED
+    spares = {"wandb": {}}  # imported and never used
     returned = ("image", "radii", "depth")
 
     def unpack(self, call: HostCall) -> RasterInputs:
@@ -83,6 +79,7 @@ class RainGS(GraphdecoAdapter):
     own_names = (f"{MODEL}:divide_ratio", "scene:args_dict", f"{PACKAGE}:GaussianRasterizer")
     dialect_type = RainDialect
     steps_by_rendering = True
+    flags = {"white_background": ("--white_bg",), "hold_out": ()}  # it always holds views out
     seams = revised(
         GraphdecoAdapter.seams,
         {
@@ -111,11 +108,6 @@ class RainGS(GraphdecoAdapter):
         if flags.exp_name and not flags.model_path:
             rest += ["-m", str(Path("output") / flags.exp_name)]
         return script, rest
-
-    def command_line(self, repo: HostRepo) -> CommandLine:
-        """Vanilla's flags, with this host's flag for white; it always holds views out."""
-        line = super().command_line(repo)
-        return replace(line, white_background=("--white_bg",), hold_out=())
 
     def densified(self, repo: HostRepo, script: Path, arguments: list[str]) -> int | None:
         """Later by the warm-up, which a mode of the host sets itself."""

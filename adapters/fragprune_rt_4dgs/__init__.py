@@ -9,15 +9,12 @@ thresholds.
 from __future__ import annotations
 
 from argparse import ArgumentParser
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from fragprune_graphdeco import GraphdecoAdapter, RasterizerCall
 from fragprune_plugins.adapting import (
-    CommandLine,
     HostInfo,
-    HostRepo,
     ModelFileError,
     ParamGroup,
     SeamCall,
@@ -63,6 +60,12 @@ class RT4DGS(GraphdecoAdapter):
     )
     own_names = (f"{MODEL}:get_marginal_t", f"{RASTERIZER}:GaussianRasterizer")
     dialect_type = RT4DGSDialect
+    flags = {
+        "save_checkpoints": "--save_iterations",
+        "config": YAMLFile("--config"),
+        "checkpoints_only": True,
+        "skipped": 2,  # iterations start at 2, and the last one takes no step
+    }
     undrawn = (
         "checkpoints of Gaussians in time for models, and no PLY",
         "Read the PSNR that the host prints at its test_iterations.",
@@ -78,19 +81,6 @@ class RT4DGS(GraphdecoAdapter):
     )
 
     # -- its command line ------------------------------------------------------------------------
-
-    def command_line(self, repo: HostRepo) -> CommandLine:
-        """The flags, and a YAML file that overrides them; models are checkpoints.
-
-        Iterations start at 2, and the last one takes no step, so two are skipped.
-        """
-        return replace(
-            super().command_line(repo),
-            save_checkpoints="--save_iterations",
-            config=YAMLFile("--config"),
-            checkpoints_only=True,
-            skipped=2,
-        )
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
         """The same command, if the host can resume this configuration."""
