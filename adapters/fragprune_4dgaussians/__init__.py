@@ -17,9 +17,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import fragprune_graphdeco as graphdeco
 from fragprune_4dgaussians.config import PythonFile
-from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
+from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall, model_seam
 from fragprune_plugins.adapting import (
     Door,
     HostCall,
@@ -28,7 +27,6 @@ from fragprune_plugins.adapting import (
     ParamGroup,
     RasterInputs,
     Role,
-    Seam,
     SeamCall,
     UsageError,
     revised,
@@ -106,7 +104,7 @@ class MovingGaussians(GraphdecoAdapter):
         ParamGroup("grid", scheduled=True),
         *GraphdecoAdapter.groups[1:],
     )
-    own_names = (f"{graphdeco.MODEL}:save_deformation", f"{graphdeco.MODEL}:_deformation_table")
+    own_names = ("save_deformation", "_deformation_table")
     dialect_type = MovingDialect
     undrawn = (
         "Gaussians that a network moves for each moment",
@@ -130,7 +128,7 @@ class MovingGaussians(GraphdecoAdapter):
                 "render": {"needs": ("viewpoint_camera", "pc", "stage"), "how": is_fine},
             },
         ),
-        Seam(Role.STILL, graphdeco.MODEL, "GaussianModel.prune"),
+        model_seam(Role.STILL, "prune"),
     )
 
     # -- its command line ------------------------------------------------------------------------

@@ -13,19 +13,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from fragprune_graphdeco import GraphdecoAdapter
+from fragprune_graphdeco import GraphdecoAdapter, model_seam
 from fragprune_plugins.adapting import (
     HostInfo,
     ParamGroup,
     Role,
     RowTrace,
-    Seam,
     SeamCall,
     UsageError,
     revised,
 )
 
-MODEL = "scene.gaussian_model"
 NETWORK = "network"
 """Our name for the param group of the hash grid and the colour network, which has none."""
 PP = "_pp.npz"
@@ -95,14 +93,14 @@ class Compact3DGS(GraphdecoAdapter):
         "Draw and measure with the host's render.py and metrics.py.",
     )
     densifies_until = ()  # it prunes by its mask to the end
-    own_names = tuple(f"{MODEL}:{name}" for name in ("vq_scale", "recolor", "mlp_head"))
+    own_names = ("vq_scale", "recolor", "mlp_head")
     seams = (
         *revised(GraphdecoAdapter.seams, {"GaussianModel.load_ply": None}),
-        Seam(Role.LOAD, MODEL, "GaussianModel.load_model", ("path",), how=most_compressed),
-        Seam(Role.SAVE, MODEL, "GaussianModel.save_npz", ("path",), how=partial(ended, by=".npz")),
-        Seam(Role.SAVE, MODEL, "GaussianModel.save_npz_pp", ("path",), how=partial(ended, by=PP)),
-        Seam(Role.STILL, MODEL, "GaussianModel.mask_prune"),
-        Seam(Role.REARRANGE, MODEL, "GaussianModel.sort_morton", how=tracing),
+        model_seam(Role.LOAD, "load_model", "path", how=most_compressed),
+        model_seam(Role.SAVE, "save_npz", "path", how=partial(ended, by=".npz")),
+        model_seam(Role.SAVE, "save_npz_pp", "path", how=partial(ended, by=PP)),
+        model_seam(Role.STILL, "mask_prune"),
+        model_seam(Role.REARRANGE, "sort_morton", how=tracing),
     )
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:

@@ -24,6 +24,7 @@ from fragprune_graphdeco.adapter import (
     GraphdecoDialect,
     default,
     group_names,
+    model_seam,
     optimizers,
     rasterizer_seam,
 )
@@ -53,6 +54,7 @@ __all__ = [
     "defaults",
     "drawing_functions",
     "group_names",
+    "model_seam",
     "needy",
     "normal_sources",
     "optimizers",

@@ -62,9 +62,10 @@ def completed(call: SeamCall) -> Any:
     return (*rest, spatial_lr_scale or call.model.spatial_lr_scale)
 
 
-def _model(
+def model_seam(
     role: Role, method: str, *needs: str, how: Callable[[SeamCall], Any] | None = None
 ) -> Seam:
+    """The seam at a method of the model."""
     return Seam(role, MODEL, f"GaussianModel.{method}", needs, how=how)
 
 
@@ -75,24 +76,24 @@ def rasterizer_seam(package: str, method: str = "forward") -> Seam:
 
 
 _GIVEN = ("grads", "grad_threshold", "scene_extent")
-CLONE = _model(Role.PARENTS, "densify_and_clone", *_GIVEN, how=clones)
-SPLIT = _model(Role.PARENTS, "densify_and_split", *_GIVEN, "N", how=splits)
+CLONE = model_seam(Role.PARENTS, "densify_and_clone", *_GIVEN, how=clones)
+SPLIT = model_seam(Role.PARENTS, "densify_and_split", *_GIVEN, "N", how=splits)
 
 MODEL_SEAMS: tuple[Seam, ...] = (
     Seam(Role.SCENE, "scene", "Scene.__init__", ("args", "gaussians")),
-    _model(Role.ATTACH, "training_setup", "training_args", how=optimizers),
-    _model(Role.STEP, "update_learning_rate", "iteration"),
+    model_seam(Role.ATTACH, "training_setup", "training_args", how=optimizers),
+    model_seam(Role.STEP, "update_learning_rate", "iteration"),
     CLONE,
     SPLIT,
-    _model(Role.KEEP, "_prune_optimizer", "mask"),
-    _model(Role.APPEND, "cat_tensors_to_optimizer", "tensors_dict"),
-    _model(Role.STILL, "densify_and_prune"),
-    _model(Role.STILL, "reset_opacity"),
-    _model(Role.STILL, "oneupSHdegree"),
-    _model(Role.SAVE, "save_ply", "path"),
-    _model(Role.LOAD, "load_ply", "path"),
-    _model(Role.CAPTURE, "capture"),
-    _model(Role.RESTORE, "restore", "model_args", "training_args", how=completed),
+    model_seam(Role.KEEP, "_prune_optimizer", "mask"),
+    model_seam(Role.APPEND, "cat_tensors_to_optimizer", "tensors_dict"),
+    model_seam(Role.STILL, "densify_and_prune"),
+    model_seam(Role.STILL, "reset_opacity"),
+    model_seam(Role.STILL, "oneupSHdegree"),
+    model_seam(Role.SAVE, "save_ply", "path"),
+    model_seam(Role.LOAD, "load_ply", "path"),
+    model_seam(Role.CAPTURE, "capture"),
+    model_seam(Role.RESTORE, "restore", "model_args", "training_args", how=completed),
 )
 
 
@@ -220,7 +221,8 @@ class GraphdecoAdapter(ScriptAdapter):
         calls: calls of the rasterizer that the dialect answers; each function makes one of them.
             The functions are those of the module that the first VIEW seam names.
         dialect_type: the dialect that answers them.
-        own_names: "module:name" of names that only this host's source mentions, not its ancestors'.
+        own_names: names that only this host's source mentions, not its ancestors': "module:name",
+            or a name in the module of the model.
         scripts: paths of training scripts in the checkout, the usual one first.
         optimizer: the host's, by its name in ``torch.optim``.
         flags: fields of ``CommandLine`` that differ from those of vanilla.
@@ -256,7 +258,8 @@ class GraphdecoAdapter(ScriptAdapter):
         missing = [
             f"no {name}" for name in self.scripts_of(repo) if not (repo.root / name).is_file()
         ]
-        for module, name in (each.split(":") for each in self.own_names):
+        for module, _, name in (each.rpartition(":") for each in self.own_names):
+            module = module or MODEL
             missing += [] if repo.mentions([module], [name]) else [f"no {name} in {module}"]
         packages = dict.fromkeys([self.package, *(each.package for each in self.calls)])
         return [

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
+from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall, model_seam
 from fragprune_plugins.adapting import (
     HostCall,
     HostInfo,
@@ -22,7 +22,6 @@ from fragprune_plugins.adapting import (
     Seam,
 )
 
-MODEL = "scene.gaussian_model"
 TRAIN, PRUNE, DISTIL = "train_densify_prune.py", "prune_finetune.py", "distill_train.py"
 
 
@@ -72,10 +71,10 @@ class LightGaussian(GraphdecoAdapter):
     seams = (
         *GraphdecoAdapter.seams,
         Seam(Role.VIEW, "gaussian_renderer", "count_render", ("viewpoint_camera", "pc")),
-        Seam(Role.STILL, MODEL, "GaussianModel.prune_gaussians"),
-        Seam(Role.STILL, MODEL, "GaussianModel.prune_opacity"),
-        Seam(Role.STILL, MODEL, "GaussianModel.densify"),
-        Seam(Role.LOAD, MODEL, "GaussianModel.load_ply_sh", ("path",)),
+        model_seam(Role.STILL, "prune_gaussians"),
+        model_seam(Role.STILL, "prune_opacity"),
+        model_seam(Role.STILL, "densify"),
+        model_seam(Role.LOAD, "load_ply_sh", "path"),
     )
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:

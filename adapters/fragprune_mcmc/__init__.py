@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
+from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall, model_seam
 from fragprune_plugins.adapting import (
     AlignmentError,
     ConfigFile,
@@ -21,16 +21,12 @@ from fragprune_plugins.adapting import (
     HostInfo,
     Role,
     RowTrace,
-    Seam,
     SeamCall,
     revised,
 )
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-
-MODEL = "scene.gaussian_model"
 
 
 @dataclass(frozen=True)
@@ -115,8 +111,6 @@ class MCMC(GraphdecoAdapter):
     flags = {"config": ConfigFile("--config")}  # its values override the others
     seams = (
         *revised(GraphdecoAdapter.seams, {"GaussianModel.update_learning_rate": {"how": no_noise}}),
-        Seam(
-            Role.REARRANGE, MODEL, "GaussianModel.relocate_gs", ("dead_mask",), how=following_copies
-        ),
-        Seam(Role.REARRANGE, MODEL, "GaussianModel.add_new_gs", ("cap_max",), how=following_copies),
+        model_seam(Role.REARRANGE, "relocate_gs", "dead_mask", how=following_copies),
+        model_seam(Role.REARRANGE, "add_new_gs", "cap_max", how=following_copies),
     )

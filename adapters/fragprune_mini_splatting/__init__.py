@@ -15,7 +15,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import fragprune_graphdeco as graphdeco
-from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
+from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall, model_seam
 from fragprune_plugins.adapting import (
     HostCall,
     HostInfo,
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-MODEL, RENDERER = "scene.gaussian_model", "gaussian_renderer"
+RENDERER = "gaussian_renderer"
 SCORING = "diff_gaussian_rasterization_ms"
 DEPTH = "GaussianRasterizer.render_depth"
 COMPRESSED = "compressed_gs.npz"
@@ -68,7 +68,7 @@ class MiniSplattingDialect(GraphdecoDialect):
         return {**super().modules(draw), SCORING: scoring}
 
 
-def masked_splits(call: SeamCall) -> Tensor:
+def masked(call: SeamCall) -> Tensor:
     """The parents of the masked split, which also takes the rows under the mask."""
     mask = call.arguments["mask"].bool()
     chosen = mask.new_zeros(len(call.model.get_xyz))
@@ -114,16 +114,16 @@ class MiniSplatting(GraphdecoAdapter):
         Seam(Role.VIEW, RENDERER, "render_depth", ("viewpoint_camera", "pc")),
         graphdeco.rasterizer_seam(SCORING),
         graphdeco.rasterizer_seam(SCORING, "render_depth"),
-        Seam(
+        model_seam(
             Role.PARENTS,
-            MODEL,
-            "GaussianModel.densify_and_split_mask",
-            ("grads", "grad_threshold", "scene_extent", "mask", "N"),
-            how=masked_splits,
+            "densify_and_split_mask",
+            *graphdeco.SPLIT.needs,
+            "mask",
+            how=masked,
         ),
-        Seam(Role.STILL, MODEL, "GaussianModel.densify_and_prune_split"),
-        Seam(Role.STILL, MODEL, "GaussianModel.prune_points", ("mask",)),
-        Seam(Role.STILL, MODEL, "GaussianModel.reinitial_pts", ("pts", "rgb")),
+        model_seam(Role.STILL, "densify_and_prune_split"),
+        model_seam(Role.STILL, "prune_points", "mask"),
+        model_seam(Role.STILL, "reinitial_pts", "pts", "rgb"),
         Seam(Role.METRIC, "lpipsPyTorch", "lpips"),
         Seam(Role.PACK, "numpy", "savez_compressed", ("file", "args"), external=True, how=packed),
         Seam(Role.UNPACK, "numpy", "load", ("file",), external=True, how=packed),

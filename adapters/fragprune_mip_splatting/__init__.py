@@ -15,7 +15,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import fragprune_graphdeco as graphdeco
-from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
+from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall, model_seam
 from fragprune_plugins.adapting import (
     HostCall,
     HostInfo,
@@ -23,14 +23,12 @@ from fragprune_plugins.adapting import (
     NotComparedError,
     RasterInputs,
     Role,
-    Seam,
     revised,
 )
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-MODEL = "scene.gaussian_model"
 KERNEL_SIZE = 0.1
 
 
@@ -76,10 +74,7 @@ class MipSplatting(GraphdecoAdapter):
         ),
     )
     calls = (RasterizerCall(frozenset({"kernel_size", "subpixel_offset"})),)
-    own_names = tuple(
-        f"{MODEL}:{name}"
-        for name in ("compute_3D_filter", "get_opacity_with_3D_filter", "filter_3D")
-    )
+    own_names = ("compute_3D_filter", "get_opacity_with_3D_filter", "filter_3D")
     dialect_type = MipDialect
     filtered = True
     seams = (
@@ -96,7 +91,7 @@ class MipSplatting(GraphdecoAdapter):
                 )
             },
         ),
-        Seam(Role.SAVE, MODEL, "GaussianModel.save_fused_ply", ("path",)),
+        model_seam(Role.SAVE, "save_fused_ply", "path"),
     )
 
     def opacities(self, model: Any) -> Tensor:

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-MODEL = "scene.gaussian_model"
 PACKAGE = "submodules.diff_gaussian_rasterization.diff_gaussian_rasterization"
 """Inside the checkout, and compiled when it is imported."""
 
@@ -76,7 +75,7 @@ class RainGS(GraphdecoAdapter):
     )
     package = PACKAGE
     calls = (RasterizerCall(frozenset({"low_pass"}), 3),)
-    own_names = (f"{MODEL}:divide_ratio", "scene:args_dict", f"{PACKAGE}:GaussianRasterizer")
+    own_names = ("divide_ratio", "scene:args_dict", f"{PACKAGE}:GaussianRasterizer")
     dialect_type = RainDialect
     steps_by_rendering = True
     flags = {"white_background": ("--white_bg",), "hold_out": ()}  # it always holds views out

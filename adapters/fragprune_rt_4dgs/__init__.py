@@ -27,8 +27,6 @@ from fragprune_rt_4dgs.dialect import ARGUMENTS, OUTPUTS, RASTERIZER, SETTINGS, 
 if TYPE_CHECKING:
     from torch import Tensor
 
-MODEL = "scene.gaussian_model"
-
 
 def with_its_map(call: SeamCall) -> Any:
     """Keep the environment map: the training loop replaces it by a new one."""
@@ -58,7 +56,7 @@ class RT4DGS(GraphdecoAdapter):
         ParamGroup("scaling_t"),
         ParamGroup("rotation_r"),
     )
-    own_names = (f"{MODEL}:get_marginal_t", f"{RASTERIZER}:GaussianRasterizer")
+    own_names = ("get_marginal_t", f"{RASTERIZER}:GaussianRasterizer")
     dialect_type = RT4DGSDialect
     flags = {
         "save_checkpoints": "--save_iterations",

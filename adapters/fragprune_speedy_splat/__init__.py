@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
+from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall, model_seam
 from fragprune_plugins.adapting import (
     EngineError,
     HostCall,
@@ -85,7 +85,7 @@ class SpeedySplat(GraphdecoAdapter):
     densifies_until = ("densify_until_iter", "prune_until_iter")
     seams = (
         *GraphdecoAdapter.seams,
-        Seam(Role.STILL, "scene.gaussian_model", "GaussianModel.prune_gaussians"),
+        model_seam(Role.STILL, "prune_gaussians"),
         Seam(Role.METRIC, "lpipsPyTorch", "lpips"),
     )
 

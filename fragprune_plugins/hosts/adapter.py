@@ -305,7 +305,8 @@ class HostAdapter(ABC):
         if repo.package in self.installed:
             return [Finding("info", "revision", repo.package, repo.commit)]
         expected = f"the installed package {self.installed[0]}, or a script that imports it"
-        return [Finding.error("other-host", repo.root, "a folder", expected)]
+        remedy = f"Train with: {self.info.usage}" if self.info.usage else ""
+        return [Finding.error("other-host", repo.root, "a folder", expected, remedy)]
 
     def match(self, repo: HostRepo) -> Match:
         """Check fingerprint and seams. An adapter that raises does not fit."""
