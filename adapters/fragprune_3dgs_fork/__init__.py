@@ -256,6 +256,7 @@ class ForkAdapter(GraphdecoAdapter):
     dialect_type = ForkDialect
     steps_by_rendering = True
     checkpoints = CHECKPOINT
+    resumes_ply = False  # a checkpoint may hold more than its PLY
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
         """Whether the model is plain, and what was read of its scripts, rows and calls."""
@@ -421,16 +422,3 @@ class ForkAdapter(GraphdecoAdapter):
         usual = super().model_file(output, iteration)
         others = [] if usual.exists() else sorted(usual.parent.glob("*point_cloud*.ply"))
         return others[0] if len(others) == 1 else usual
-
-    def captured(self, ply: Path) -> tuple[Any, ...]:
-        """Refused: a fork's checkpoint may hold more than its PLY.
-
-        Raises:
-            UsageError: always.
-        """
-        raise UsageError(
-            str(ply),
-            "a PLY, from which no checkpoint of a fork can be made",
-            "a checkpoint of its own training",
-            "Name one with --start_checkpoint, or prune the PLY: fragprune finetune.",
-        )

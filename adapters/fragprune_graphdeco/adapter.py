@@ -225,6 +225,7 @@ class GraphdecoAdapter(ScriptAdapter):
             or a name in the module of the model.
         scripts: paths of training scripts in the checkout, the usual one first.
         optimizer: the host's, by its name in ``torch.optim``.
+        resumes_ply: a checkpoint that it can resume can be made from its PLY.
         flags: fields of ``CommandLine`` that differ from those of vanilla.
         checkpoints: how names of checkpoints begin, before the iteration; a regular expression.
         densifies_until: arguments with the iterations after which the host adds, relocates, prunes
@@ -243,6 +244,7 @@ class GraphdecoAdapter(ScriptAdapter):
     optimizer = "Adam"
     densifies_until: tuple[str, ...] = ("densify_until_iter",)
     filtered = False
+    resumes_ply = True
     undrawn: tuple[str, ...] = ()
     flags: ClassVar[Mapping[str, Any]] = MappingProxyType({})
     checkpoints = "chkpnt"
@@ -400,6 +402,8 @@ class GraphdecoAdapter(ScriptAdapter):
         """Write the tuple of ``captured``."""
         import torch
 
+        if not self.resumes_ply:
+            return super().checkpoint_from_ply(ply, iteration, target)
         capture = self.captured(ply)
         with replacing(target) as temporary:
             torch.save((capture, iteration), temporary)

@@ -10,12 +10,11 @@ from __future__ import annotations
 
 from argparse import ArgumentParser
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
 from fragprune_graphdeco import GraphdecoAdapter, RasterizerCall
 from fragprune_plugins.adapting import (
     HostInfo,
-    ModelFileError,
     ParamGroup,
     SeamCall,
     UsageError,
@@ -64,6 +63,7 @@ class RT4DGS(GraphdecoAdapter):
         "checkpoints_only": True,
         "skipped": 2,  # iterations start at 2, and the last one takes no step
     }
+    resumes_ply = False
     undrawn = (
         "checkpoints of Gaussians in time for models, and no PLY",
         "Read the PSNR that the host prints at its test_iterations.",
@@ -130,12 +130,3 @@ class RT4DGS(GraphdecoAdapter):
         path = self.model_file(output, iteration)
         torch.save((model.capture(), iteration), path)
         return path
-
-    def captured(self, ply: Path) -> NoReturn:
-        """Refuse: a PLY holds no time."""
-        raise ModelFileError(
-            str(ply),
-            "a PLY, which has no place for Gaussians in time",
-            "chkpnt*.pth, as RT-4DGS saves",
-            "Name one with --start_checkpoint.",
-        )

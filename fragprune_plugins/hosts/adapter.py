@@ -484,6 +484,6 @@ class ScriptAdapter(HostAdapter):
         raise UsageError(
             str(ply),
             f"a PLY, from which {self.info.title} cannot resume",
-            "what its script resumes from",
-            "See its --help.",
+            "a checkpoint of its own training",
+            "Name one with its flag for that, or prune the PLY: fragprune finetune.",
         )

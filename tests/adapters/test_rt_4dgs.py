@@ -9,7 +9,7 @@ from miniatures.rt_4dgs import PythonHost, RigidHost, RT4DGSHost
 from scenes import blended
 
 from fragprune_plugins.engines.reference import ReferenceEngine
-from fragprune_plugins.errors import AlignmentError, ModelFileError, UsageError
+from fragprune_plugins.errors import AlignmentError, UsageError
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.injection.stand_ins import runs_here
@@ -358,7 +358,7 @@ def test_the_hosts_own_rasterizer_stays_where_it_can_be_compiled(mini, monkeypat
 
 
 def test_a_ply_is_no_model_of_this_host(tmp_path):
-    with pytest.raises(ModelFileError, match=r"chkpnt\*\.pth"):
+    with pytest.raises(UsageError, match="a PLY, from which RT-4DGS cannot resume"):
         RT4DGS().checkpoint_from_ply(tmp_path / "a.ply", 3, tmp_path / "b.pth")
 
 

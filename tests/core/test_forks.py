@@ -63,13 +63,13 @@ def test_a_value_that_is_read_needs_a_kernel_that_tells_what_it_is(tmp_path, val
     used = (USED[0], USED[1].format(value))
     known = fork(tmp_path / "known", used, values=f"image, radii, {value}", kernel=MEANINGS[value])
     assert errors(known) == []
-    (roles,) = ForkAdapter().dialect(known).values.values()
+    (roles,) = ForkAdapter().dialect(known).fork.outputs.values()
     assert [each.role for each in roles] == ["image", "radii", value]
     absent = fork(tmp_path / "absent", used, values=f"image, radii, {value}")
     assert errors(absent) == []
     warned = [each for each in ForkAdapter().match(absent).findings if each.level == "warning"]
     assert f"what diff_gaussian_rasterization returns as {value}" in str(warned)
-    (roles,) = ForkAdapter().dialect(absent).values.values()
+    (roles,) = ForkAdapter().dialect(absent).fork.outputs.values()
     assert roles[2].role == "unproved"
     other = MEANINGS[value].replace("] = ", "] = 2 * ")
     scaled = fork(tmp_path / "scaled", used, values=f"image, radii, {value}", kernel=other)
@@ -88,7 +88,7 @@ def test_blended_channels_are_known_by_argument_and_kernel(tmp_path, name):
     given = {"values": values, "arguments": f", {name}=pc.get_objects"}
     known = fork(tmp_path / "known", used, **given, kernel=OBJECTS)
     assert errors(known) == []
-    assert ForkAdapter().dialect(known).blended == {"diff_gaussian_rasterization": name}
+    assert ForkAdapter().dialect(known).fork.blended == {"diff_gaussian_rasterization": name}
     assert errors(fork(tmp_path / "unknown", used, **given))
     lit = OBJECTS.replace("= O[ch]", "= O[ch] + T * bg[ch]")
     assert errors(fork(tmp_path / "lit", used, **given, kernel=lit))
@@ -123,7 +123,7 @@ def test_a_sum_for_each_gaussian_is_known_by_its_kernel(tmp_path, what):
         return
     assert errors(repo) == []
     dialect = ForkAdapter().dialect(repo)
-    value = dialect.values["diff_gaussian_rasterization"][2]
+    value = dialect.fork.outputs["diff_gaussian_rasterization"][2]
     assert (value.role, value.column, value.integer) == expected
 
 
@@ -150,7 +150,7 @@ def test_a_setting_that_is_off_is_served_as_long_as_it_is_off(tmp_path, what):
     options.write_text(OPTIONS)
     assert errors(repo) == []
     dialect = ForkAdapter().dialect(repo)
-    assert dialect.off == {"mult"}
+    assert dialect.fork.off == {"mult"}
     with pytest.raises(EngineError, match="None or False"):
         dialect.expect_off(HostCall(SimpleNamespace(mult=0.5), {}))
     dialect.expect_off(HostCall(SimpleNamespace(mult=None), {}))
@@ -477,7 +477,7 @@ def test_neighbours_of_its_own_have_no_stand_in(tmp_path, taken):
 
 
 def test_no_checkpoint_is_made_from_a_forks_ply(tmp_path):
-    with pytest.raises(UsageError, match="no checkpoint of a fork"):
+    with pytest.raises(UsageError, match="cannot resume"):
         ForkAdapter().checkpoint_from_ply(tmp_path / "a.ply", 7, tmp_path / "made.pth")
     assert not (tmp_path / "made.pth").exists()
 
