@@ -36,7 +36,6 @@ from fragprune_plugins.adapting import (
     HostCall,
     HostInfo,
     HostRepo,
-    NotComparedError,
     RasterInputs,
     RasterOutputs,
     Role,
@@ -395,21 +394,12 @@ class ForkAdapter(GraphdecoAdapter):
                 "Leave it out, or prune its PLY: fragprune finetune.",
             )
 
-    def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any]:
-        """Vanilla's rules, where a PLY alone makes the picture.
-
-        Raises:
-            NotComparedError: a network moves the Gaussians, or colours them.
-        """
+    def not_drawn(self, repo: HostRepo, arguments: list[str]) -> list[str]:
+        """Also what makes a picture beside the PLY: a network that moves or colours Gaussians."""
         by = [f"--{name}" for name in read_fork(repo).colours if f"--{name}" in arguments]
-        for why in (*by, *sorted(graphdeco.read_plain(repo).moved)):
-            raise NotComparedError(
-                "the host's command",
-                f"a PLY is not all that it draws: {why}",
-                "pictures of a PLY alone",
-                "Draw and measure with the host's render.py and metrics.py.",
-            )
-        return super().drawing(repo, arguments)
+        why = [*by, *sorted(graphdeco.read_plain(repo).moved)]
+        beside = [f"a PLY is not all that it draws: {each}" for each in why]
+        return beside + super().not_drawn(repo, arguments)
 
     def densified(self, repo: HostRepo, script: Path, arguments: list[str]) -> int | None:
         """As 3DGS tells, if scripts change the model only until then; else unknown."""

@@ -48,10 +48,6 @@ PRUNING = tuple(
     )
 )
 """What MCMC's training script imports for modes that we do not know."""
-SETTINGS = (
-    *("image_height", "image_width", "tanfovx", "tanfovy", "bg", "scale_modifier", "viewmatrix"),
-    *("projmatrix", "sh_degree", "campos", "prefiltered", "debug", "antialiasing"),
-)
 
 
 class PackageDialect(GraphdecoDialect):
@@ -186,10 +182,6 @@ class GaussianSplatting(GraphdecoAdapter):
         """Check that this is the installed package, not a checkout of the same name."""
         package = HostAdapter.fingerprint(self, repo)
         return [*package, *super().fingerprint(repo)] if repo.package else package
-
-    def dialect(self, repo: HostRepo) -> PackageDialect:
-        """The dialect of the only rasterizer call, in ``GaussianModel.render``."""
-        return PackageDialect(package=RASTERIZER, settings=SETTINGS, outputs=3)
 
     def command_line(self, repo: HostRepo) -> CommandLine:
         """The flags of ``gaussian_splatting.train``, which MCMC's script shares."""

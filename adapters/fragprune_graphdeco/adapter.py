@@ -225,6 +225,7 @@ class GraphdecoAdapter(ScriptAdapter):
             or a name in the module of the model.
         scripts: paths of training scripts in the checkout, the usual one first.
         optimizer: the host's, by its name in ``torch.optim``.
+        undrawn_flags: flags with which our readers draw other pictures.
         resumes_ply: a checkpoint that it can resume can be made from its PLY.
         flags: fields of ``CommandLine`` that differ from those of vanilla.
         checkpoints: how names of checkpoints begin, before the iteration; a regular expression.
@@ -246,6 +247,7 @@ class GraphdecoAdapter(ScriptAdapter):
     filtered = False
     resumes_ply = True
     undrawn: tuple[str, ...] = ()
+    undrawn_flags: tuple[str, ...] = ("--antialiasing", "--train_test_exp")
     flags: ClassVar[Mapping[str, Any]] = MappingProxyType({})
     checkpoints = "chkpnt"
     seams = (
@@ -465,19 +467,23 @@ class GraphdecoAdapter(ScriptAdapter):
             flags.images or "images",
         )
 
+    def not_drawn(self, repo: HostRepo, arguments: list[str]) -> list[str]:
+        """What of a command our readers would draw otherwise."""
+        flags = (flag for flag in self.undrawn_flags if flag in arguments)
+        return [f"{flag}, which our readers do not support" for flag in flags]
+
     def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any]:
         """No fields: vanilla's rules apply."""
         if self.undrawn:
             found, remedy = self.undrawn
             raise NotComparedError(self.info.title, found, "models that we can draw", remedy)
-        for flag in ("--antialiasing", "--train_test_exp"):
-            if flag in arguments:
-                raise NotComparedError(
-                    "the host's command",
-                    f"{flag}, which our readers do not support",
-                    "pictures as the host draws them",
-                    "Draw and measure with the host's render.py and metrics.py.",
-                )
+        for found in self.not_drawn(repo, arguments):
+            raise NotComparedError(
+                "the host's command",
+                found,
+                "pictures as the host draws them",
+                "Draw and measure with the host's render.py and metrics.py.",
+            )
         return {}
 
     def model_file(self, output: Path, iteration: int) -> Path:

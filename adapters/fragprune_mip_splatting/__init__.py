@@ -20,7 +20,6 @@ from fragprune_plugins.adapting import (
     HostCall,
     HostInfo,
     HostRepo,
-    NotComparedError,
     RasterInputs,
     Role,
     revised,
@@ -77,6 +76,7 @@ class MipSplatting(GraphdecoAdapter):
     own_names = ("compute_3D_filter", "get_opacity_with_3D_filter", "filter_3D")
     dialect_type = MipDialect
     filtered = True
+    undrawn_flags = (*GraphdecoAdapter.undrawn_flags, "--load_allres")
     seams = (
         *revised(
             GraphdecoAdapter.seams,
@@ -100,19 +100,9 @@ class MipSplatting(GraphdecoAdapter):
         return opacities.detach().reshape(-1)
 
     def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any]:
-        """The command's 2D filter, or the default; ``--load_allres`` is refused."""
+        """The command's 2D filter, or the default."""
         parser = ArgumentParser(add_help=False)
         size = graphdeco.default(repo, "_kernel_size", KERNEL_SIZE)
         parser.add_argument("-k", "--kernel_size", type=float, default=size)
-        flags, rest = parser.parse_known_args(arguments)
-        if "--load_allres" in rest:
-            raise NotComparedError(
-                "--load_allres",
-                "every view at several sizes",
-                "one size",
-                "Measure with the host's render.py and metrics.py.",
-            )
-        return super().drawing(repo, rest) | {
-            "dilation": flags.kernel_size,
-            "compensation": "mip",
-        }
+        size = parser.parse_known_args(arguments)[0].kernel_size
+        return super().drawing(repo, arguments) | {"dilation": size, "compensation": "mip"}
