@@ -64,8 +64,8 @@ class PackageDialect(GraphdecoDialect):
         """Stand-ins for the rasterizer, the neighbour distances and the relocation."""
         from fragprune_graphdeco import stand_ins
 
-        relocation = ModuleType(RELOCATION, "Stand-in of fragprune.")
-        vars(relocation)["compute_relocation"] = stand_ins.compute_relocation
+        compute = stand_ins.compute_relocation
+        relocation = stand_ins.module(RELOCATION, compute_relocation=compute)
         modules = super().modules(draw)
         rasterizer = modules.pop(self.package)
         nested = {f"{PACKAGE}.{name}": module for name, module in modules.items()}

@@ -76,24 +76,26 @@ def rasterizer(
     for name in ("forward", *also):
         setattr(GaussianRasterizer, name, entry(name))
 
-    module = ModuleType(package, "Stand-in of fragprune for a compiled rasterizer.")
-    members: dict[str, Any] = {
-        "GaussianRasterizationSettings": settings_type,
-        "GaussianRasterizer": GaussianRasterizer,
-    }
-    if sparse_adam:
-        members["SparseGaussianAdam"] = SparseGaussianAdam
-    vars(module).update(members)
-    return module
+    also_sparse = {"SparseGaussianAdam": SparseGaussianAdam} if sparse_adam else {}
+    return module(
+        package,
+        GaussianRasterizationSettings=settings_type,
+        GaussianRasterizer=GaussianRasterizer,
+        **also_sparse,
+    )
+
+
+def module(name: str, **members: Any) -> ModuleType:
+    """A stand-in under an import name."""
+    made = ModuleType(name, "Stand-in of fragprune for a compiled module.")
+    vars(made).update(members)
+    return made
 
 
 def simple_knn() -> dict[str, ModuleType]:
     """``simple_knn._C.distCUDA2``."""
-    package = ModuleType("simple_knn", "Stand-in of fragprune.")
-    package.__path__ = []
-    extension = ModuleType("simple_knn._C", "Stand-in of fragprune.")
-    vars(extension)["distCUDA2"] = mean_squared_neighbour_distance
-    vars(package)["_C"] = extension
+    extension = module("simple_knn._C", distCUDA2=mean_squared_neighbour_distance)
+    package = module("simple_knn", __path__=[], _C=extension)
     return {"simple_knn": package, "simple_knn._C": extension}
 
 
@@ -165,9 +167,7 @@ def fused_ssim() -> dict[str, ModuleType]:
             values[..., border:-border, border:-border] if padding == "valid" else values
         ).mean()
 
-    module = ModuleType("fused_ssim", "Stand-in of fragprune.")
-    vars(module)["fused_ssim"] = similarity
-    return {"fused_ssim": module}
+    return {"fused_ssim": module("fused_ssim", fused_ssim=similarity)}
 
 
 class SparseGaussianAdam(torch.optim.Adam):

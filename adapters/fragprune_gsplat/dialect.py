@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from fragprune_graphdeco import stand_ins
 from fragprune_gsplat.harmonics import basis
 from fragprune_gsplat.projection import TILE, Projection, Rules, covariances, project
 from fragprune_plugins.adapting import (
@@ -248,9 +249,7 @@ class GsplatDialect(Dialect):
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
         """A stand-in that keeps gsplat from compiling its kernels; ``answers`` has what we need."""
-        backend = ModuleType(BACKEND, "Stand-in of fragprune for compiled kernels.")
-        vars(backend)["_C"] = None
-        return {BACKEND: backend}
+        return {BACKEND: stand_ins.module(BACKEND, _C=None)}
 
 
 _INTRINSICS = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}

@@ -108,9 +108,11 @@ class RT4DGSDialect(GraphdecoDialect):
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
         """Stand-ins for the rasterizer, simple_knn and the neighbours of the rigidity loss."""
-        from fragprune_rt_4dgs import neighbours
+        from fragprune_graphdeco import stand_ins
+        from fragprune_rt_4dgs.neighbours import knnquery
 
-        return {**super().modules(draw), **neighbours.modules()}
+        neighbours = stand_ins.module("pointops2_cuda", knnquery_cuda=knnquery)
+        return {**super().modules(draw), "pointops2_cuda": neighbours}
 
 
 def at_moment(call: HostCall) -> Sliced:

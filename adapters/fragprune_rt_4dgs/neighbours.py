@@ -2,17 +2,8 @@
 
 from __future__ import annotations
 
-from types import ModuleType
-
 import torch
 from torch import Tensor
-
-
-def modules() -> dict[str, ModuleType]:
-    """The stand-in under its import name, with only the functions that the host calls."""
-    module = ModuleType("pointops2_cuda", "Stand-in of fragprune.")
-    vars(module)["knnquery_cuda"] = knnquery
-    return {"pointops2_cuda": module}
 
 
 def knnquery(
