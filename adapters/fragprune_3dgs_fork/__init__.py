@@ -21,6 +21,7 @@ from fragprune_3dgs_fork.fork import (
     CHECKPOINT,
     CLASS,
     MODEL,
+    RENDERER,
     Fork,
     plain_distances,
     read_fork,
@@ -305,17 +306,17 @@ class ForkAdapter(GraphdecoAdapter):
             *(() if fork.one_run else (of(Role.CAPTURE, "capture"), of(Role.RESTORE, "restore"))),
             Seam(Role.LOSS, "torch", "Tensor.backward", external=True),
             *(
-                Seam(Role.VIEW, draw.module, draw.function, (draw.camera, draw.model))
+                Seam(Role.VIEW, RENDERER, draw.function, (draw.camera, draw.model))
                 for draw in fork.draws
             ),
-            *map(graphdeco.rasterizer_seam, fork.packages),
+            *map(graphdeco.rasterizer_seam, fork.outputs),
         )
 
     def dialect(self, repo: HostRepo) -> ForkDialect:
         """The dialect of the calls that were read."""
         fork = read_fork(repo)
         return ForkDialect(
-            package=next(iter(fork.packages), self.package),
+            package=next(iter(fork.outputs), self.package),
             settings=next(iter(fork.settings.values()), ()),
             outputs=2,
             sparse_adam=bool(repo.mentions(["train", MODEL], ["SparseGaussianAdam"])),

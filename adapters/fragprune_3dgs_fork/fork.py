@@ -16,7 +16,14 @@ from fragprune_3dgs_fork.rasterizer import (
     changed_gradients,
     meaning,
 )
-from fragprune_plugins.adapting import Finding, HostRepo, is_off, nodes, off_by_default
+from fragprune_plugins.adapting import (
+    Finding,
+    Function,
+    HostRepo,
+    is_off,
+    nodes,
+    off_by_default,
+)
 
 MODEL, CLASS, RENDERER = "scene.gaussian_model", "GaussianModel", "gaussian_renderer"
 PARAMETERS = {"_xyz", "_features_dc", "_features_rest", "_opacity", "_scaling", "_rotation"}
@@ -37,8 +44,6 @@ _OPTIMIZER = re.compile(r"(torch\.)?(optim\.)?\w*(Adam|SGD|RMSprop)\w*\(")
 _CAMERA = re.compile(r"view|cam")
 _MODEL_ARGUMENTS = ("pc", "gaussians", "gaussian", "model")
 
-Function = ast.FunctionDef | ast.AsyncFunctionDef
-
 NEUTRAL = {"antialiasing", "confidence"}
 """Further settings that the engines know, or that are checked to be neutral at every call."""
 SERVED = {"dc"}
@@ -55,14 +60,12 @@ class Draw:
     """A drawing function that a training script reaches.
 
     Attributes:
-        module: of the function.
         function: its name.
         camera: its parameter with the camera.
         model: its parameter with the model.
         calls: of a rasterizer, in source order.
     """
 
-    module: str
     function: str
     camera: str
     model: str
@@ -131,11 +134,6 @@ class Fork:
         """Why it cannot be served."""
         return [each for each in self.findings if each.level == "error"]
 
-    @property
-    def packages(self) -> tuple[str, ...]:
-        """The rasterizers, that of the first draw first."""
-        return tuple(self.outputs)
-
     @cached_property
     def settings(self) -> dict[str, tuple[str, ...]]:
         """Names of the settings, by rasterizer, also of those that no script reaches."""
@@ -148,17 +146,10 @@ class Fork:
     # -- modules ----------------------------------------------------------------------------------
 
     @cached_property
-    def modules(self) -> tuple[str, ...]:
+    def trees(self) -> dict[str, ast.Module]:
         """The scripts and the checkout's own modules that they import, without model and draws."""
         seen = _imported(self.repo, map(_module, self.scripts))
-        return tuple(each for each in seen if not _OF_MODELS.search(each))
-
-    def trees(self) -> Iterator[tuple[str, ast.Module]]:
-        """``modules`` with their trees."""
-        for module in self.modules:
-            tree = self.repo.tree(module)
-            if tree is not None:
-                yield module, tree
+        return {each: tree for each, tree in seen.items() if not _OF_MODELS.search(each)}
 
 
 _known: WeakKeyDictionary[HostRepo, Fork] = WeakKeyDictionary()
@@ -196,15 +187,15 @@ def _module(script: str) -> str:
     return script.removesuffix(".py").replace("/", ".")
 
 
-def _imported(repo: HostRepo, modules: Iterable[str]) -> dict[str, None]:
+def _imported(repo: HostRepo, modules: Iterable[str]) -> dict[str, ast.Module]:
     """Modules and those of the checkout that they import, without the renderer's."""
-    waiting, seen = [*modules], dict[str, None]()
+    waiting, seen = [*modules], dict[str, ast.Module]()
     while waiting:
         module = waiting.pop(0)
         tree = repo.tree(module)
         if module in seen or tree is None or module.split(".")[0] == RENDERER:
             continue
-        seen[module] = None
+        seen[module] = tree
         for node in nodes(tree):
             if isinstance(node, ast.Import | ast.ImportFrom):
                 waiting += repo.imported_by(module, node)
@@ -243,11 +234,10 @@ def _read_scripts(fork: Fork, scripts: tuple[str, ...]) -> None:
 
 def _networks(repo: HostRepo, script: str) -> set[str]:
     """Classes that a script imports and that save no PLY: they are no models of Gaussians."""
-    trees = map(repo.tree, _imported(repo, [_module(script)]))
     return {
         node.name
-        for tree in trees
-        for node in (tree.body if tree else ())
+        for tree in _imported(repo, [_module(script)]).values()
+        for node in tree.body
         if isinstance(node, ast.ClassDef)
         and node.name != CLASS
         and not node.bases[1:]
@@ -379,7 +369,7 @@ def _read_methods(fork: Fork) -> None:
         if any(_target(node) == "optimizer" for node in nodes(body)) and name != "__init__"
     )
     called: dict[str, None] = {}
-    for module, tree in fork.trees():
+    for module, tree in fork.trees.items():
         owners = _owners(tree)
         statements = {id(each.value) for each in nodes(tree) if isinstance(each, ast.Expr)}
         for node, name in _method_calls(tree):
@@ -391,11 +381,11 @@ def _read_methods(fork: Fork) -> None:
                     at = fork.repo.at(module, node.lineno)
                     fork.refuse("row-change", at, f"reads what {name} returns", "a statement")
     fork.still = tuple(name for name in methods if name in called)
-    for name in ("_prune_optimizer",):
-        body = methods.get(name)
-        if body is not None and "[mask]" not in ast.unparse(body):
-            place = fork.repo.place(MODEL, f"{CLASS}.{name}")
-            fork.refuse("row-change", place, f"{name} keeps other rows than its mask's", "[mask]")
+    keeps = methods.get("_prune_optimizer")
+    if keeps is not None and "[mask]" not in ast.unparse(keeps):
+        place = fork.repo.place(MODEL, f"{CLASS}._prune_optimizer")
+        found = "_prune_optimizer keeps other rows than its mask's"
+        fork.refuse("row-change", place, found, "[mask]")
 
 
 def _owners(tree: ast.AST) -> set[str]:
@@ -462,7 +452,7 @@ def _assigned(body: ast.AST, owner: str = "") -> Iterator[tuple[int, str]]:
 
 def _read_changes(fork: Fork) -> None:
     """A script that changes parameters itself cannot be held still in stage 2."""
-    for module, tree in fork.trees():
+    for module, tree in fork.trees.items():
         for line, name in _assigned(tree):
             at = fork.repo.at(module, line)
             fork.refuse("row-change", at, f"changes {name} outside the model's methods", "none")
@@ -488,7 +478,7 @@ def read_getters(fork: Fork) -> list[Finding]:
     that is None at first, if no method that scripts reach sets it.
     """
     methods = _methods(fork.repo)
-    reached = {name for _, tree in fork.trees() for _, name in _method_calls(tree)}
+    reached = {name for tree in fork.trees.values() for _, name in _method_calls(tree)}
     while more := {
         called
         for name in reached & methods.keys()
@@ -513,7 +503,7 @@ def read_getters(fork: Fork) -> list[Finding]:
 
 def _read_draws(fork: Fork) -> None:
     """The drawing functions that a script names, and their calls."""
-    named = {name for _, tree in fork.trees() for name in _reached(fork, tree)}
+    named = {name for tree in fork.trees.values() for name in _reached(fork, tree)}
     functions = graphdeco.drawing_functions(fork.repo, RENDERER)
     while True:
         reached = [name for name in functions if name in named]
@@ -538,7 +528,7 @@ def _read_draws(fork: Fork) -> None:
         if not calls or not all(call.names for call in calls):
             fork.refuse("rasterizer-call", at, "a result that is not unpacked", "its values")
             continue
-        fork.draws += (Draw(RENDERER, name, camera, model, calls),)
+        fork.draws += (Draw(name, camera, model, calls),)
         for call in calls:
             _check_call(fork, at, name, call)
         if selected := graphdeco.read_selection(fork.repo, RENDERER, name):
@@ -611,7 +601,7 @@ def _stays_off(fork: Fork, function: str, value: ast.expr | None) -> bool:
     if value.id not in off_by_default(body):
         return False
     number = names.index(value.id) if value.id in names else len(names)
-    for _, tree in fork.trees():
+    for tree in fork.trees.values():
         for node in ast.walk(tree):
             passed = {each.arg: each.value for each in getattr(node, "keywords", ())}
             if value.id in passed and not _stays_off(fork, "", passed[value.id]):
@@ -633,7 +623,7 @@ def _read_outputs(fork: Fork) -> None:
             roles = tuple(_output(fork, draw, call, number) for number in range(len(call.names)))
             known = fork.outputs.get(package)
             if known is not None and len(known) != len(roles):
-                at = fork.repo.at(draw.module, call.line)
+                at = fork.repo.at(RENDERER, call.line)
                 fork.refuse(
                     "rasterizer-call", at, f"{len(roles)} and {len(known)} values", "one form"
                 )
@@ -662,13 +652,13 @@ def _output(fork: Fork, draw: Draw, call: graphdeco.CallInSource, number: int) -
     output = meaning(fork.repo, call, name)
     uses = _uses(fork, draw, name) if output.role == "unread" else []
     if uses and _PROVABLE.search(name) and not graphdeco.normal_sources(fork.repo, package):
-        at = fork.repo.at(draw.module, call.line)
+        at = fork.repo.at(RENDERER, call.line)
         fork.warn("rasterizer-output", at, f"what {package} returns as {name}")
         return Output(name, "unproved")
     if uses:
         fork.refuse(
             "rasterizer-output",
-            f"{draw.module}:{draw.function} ({fork.repo.at(draw.module, call.line)})",
+            f"{RENDERER}:{draw.function} ({fork.repo.at(RENDERER, call.line)})",
             f"{name}, read in {uses[0]}, whose meaning is unknown",
             "picture, radii, and sums along the ray whose kernel was read",
         )
@@ -677,7 +667,7 @@ def _output(fork: Fork, draw: Draw, call: graphdeco.CallInSource, number: int) -
 
 def _uses(fork: Fork, draw: Draw, name: str) -> list[str]:
     """Places that read an output: in its function, or by its key where scripts draw."""
-    body = fork.repo.function(draw.module, draw.function)
+    body = fork.repo.function(RENDERER, draw.function)
     if body is None or name in ("", "_"):
         return []
     keys: set[str] = set()
@@ -694,14 +684,14 @@ def _uses(fork: Fork, draw: Draw, name: str) -> list[str]:
                 keys.add(str(target.slice.value))
                 handed.add(id(node.value))
     places = [
-        fork.repo.at(draw.module, node.lineno)
+        fork.repo.at(RENDERER, node.lineno)
         for node in ast.walk(body)
         if isinstance(node, ast.Name)
         and node.id == name
         and isinstance(node.ctx, ast.Load)
         and id(node) not in handed
     ]
-    for module, tree in fork.trees():
+    for module, tree in fork.trees.items():
         passed = {
             id(inner)
             for node, method in _method_calls(tree)
