@@ -29,7 +29,7 @@ from fragprune_3dgs_fork.fork import (
     rests_after_densification,
 )
 from fragprune_3dgs_fork.rasterizer import Output
-from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect
+from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, plain, reading
 from fragprune_plugins.adapting import (
     CommandLine,
     EngineError,
@@ -224,8 +224,8 @@ class ForkDialect(GraphdecoDialect):
 
     def names(self) -> frozenset[str]:
         """The import names of the rasterizers and simple_knn."""
-        plain = plain_distances(self.fork.repo)
-        distances = frozenset() if plain else {"simple_knn", "simple_knn._C"}
+        ours = plain_distances(self.fork.repo)
+        distances = frozenset() if ours else {"simple_knn", "simple_knn._C"}
         return (super().names() | self.fork.settings.keys()) - distances
 
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
@@ -262,16 +262,16 @@ class ForkAdapter(GraphdecoAdapter):
         """Whether the model is plain, and what was read of its scripts, rows and calls."""
         if repo.tree(MODEL) is None or repo.package:
             return self.other_host(repo, [f"no {MODEL}"])
-        plain = graphdeco.read_plain(repo)
-        others = [each for each in plain.reasons if each not in plain.moved]
-        if others or not plain.model:
+        model = plain.read_plain(repo)
+        others = [each for each in model.reasons if each not in model.moved]
+        if others or not model.model:
             return [Finding.error("not-plain", MODEL, others[0], "a plain 3DGS model")]
         fork = read_fork(repo)
         served = replace(self.command_line(repo), scripts=fork.scripts)
         return [
             *fork.findings,
             *read_getters(fork),
-            *(graphdeco.read_flags(repo, served) if fork.scripts else ()),
+            *(reading.read_flags(repo, served) if fork.scripts else ()),
             *self._groups(repo),
         ]
 
@@ -398,7 +398,7 @@ class ForkAdapter(GraphdecoAdapter):
     def not_drawn(self, repo: HostRepo, arguments: list[str]) -> list[str]:
         """Also what makes a picture beside the PLY: a network that moves or colours Gaussians."""
         by = [f"--{name}" for name in read_fork(repo).colours if f"--{name}" in arguments]
-        why = [*by, *sorted(graphdeco.read_plain(repo).moved)]
+        why = [*by, *sorted(plain.read_plain(repo).moved)]
         beside = [f"a PLY is not all that it draws: {each}" for each in why]
         return beside + super().not_drawn(repo, arguments)
 

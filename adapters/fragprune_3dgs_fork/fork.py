@@ -16,6 +16,7 @@ from fragprune_3dgs_fork.rasterizer import (
     changed_gradients,
     meaning,
 )
+from fragprune_graphdeco import kernels, plain, reading
 from fragprune_plugins.adapting import (
     Finding,
     Function,
@@ -122,7 +123,7 @@ class Fork:
     def is_off(self, name: str) -> bool:
         """Whether an option or an attribute of the model is None or False by default."""
         modules = ("arguments", MODEL, *map(_module, self.scripts))
-        values = [each for m in modules for each in graphdeco.defaults(self.repo, m, name)]
+        values = [each for m in modules for each in reading.defaults(self.repo, m, name)]
         return bool(values) and all(map(is_off, values))
 
     def refuse(self, code: str, where: str, found: str, expected: str) -> None:
@@ -158,7 +159,7 @@ _known: WeakKeyDictionary[HostRepo, Fork] = WeakKeyDictionary()
 def read_fork(repo: HostRepo) -> Fork:
     """Read a checkout, once; of several scripts only those that can be served, if one can."""
     if repo not in _known:
-        fork = _read(repo, graphdeco.training_scripts(repo, "*train*.py", "*/*train*.py"))
+        fork = _read(repo, reading.training_scripts(repo, "*train*.py", "*/*train*.py"))
         if fork.errors and len(fork.scripts) > 1:
             alone = {script: _read(repo, (script,)) for script in fork.scripts}
             if served := tuple(script for script, each in alone.items() if not each.errors):
@@ -495,7 +496,7 @@ def read_getters(fork: Fork) -> list[Finding]:
     body = methods.get("get_xyz")
     asked = re.findall(r"self\.(\w+) is not None", ast.unparse(body)) if body else []
     unset = {each for each in asked if fork.is_off(each)} - made
-    return graphdeco.read_getters(fork.repo, MODEL, unset)
+    return reading.read_getters(fork.repo, MODEL, unset)
 
 
 # -- draws -----------------------------------------------------------------------------------------
@@ -531,7 +532,7 @@ def _read_draws(fork: Fork) -> None:
         fork.draws += (Draw(name, camera, model, calls),)
         for call in calls:
             _check_call(fork, at, name, call)
-        if selected := graphdeco.read_selection(fork.repo, RENDERER, name):
+        if selected := plain.read_selection(fork.repo, RENDERER, name):
             fork.refuse("rasterizer-call", at, f"draws a selection, {selected}", "all rows")
         fork.colours |= {
             node.test.attr
@@ -651,7 +652,7 @@ def _output(fork: Fork, draw: Draw, call: graphdeco.CallInSource, number: int) -
         return Output(name, "radii")
     output = meaning(fork.repo, call, name)
     uses = _uses(fork, draw, name) if output.role == "unread" else []
-    if uses and _PROVABLE.search(name) and not graphdeco.normal_sources(fork.repo, package):
+    if uses and _PROVABLE.search(name) and not kernels.normal_sources(fork.repo, package):
         at = fork.repo.at(RENDERER, call.line)
         fork.warn("rasterizer-output", at, f"what {package} returns as {name}")
         return Output(name, "unproved")

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import fragprune_graphdeco as graphdeco
+from fragprune_graphdeco import kernels
 from fragprune_plugins.adapting import HostRepo, is_off
 
 Role = Literal[
@@ -60,7 +61,7 @@ def meaning(repo: HostRepo, call: graphdeco.CallInSource, name: str) -> Output:
     late = "antialiasing" in call.settings and len(call.names) == 3
     if late and call.package == "diff_gaussian_rasterization":
         return Output(name, "invdepth")  # the rasterizer since August 2024
-    text = "".join(graphdeco.normal_sources(repo, call.package))
+    text = "".join(kernels.normal_sources(repo, call.package))
     if role := _sum_for_gaussians(text, name):
         made = re.search(rf"{name}=torch::\w+\(\{{\w+(,1)?\}}[^;]*;", text)
         whole = made is not None and "kInt" in made[0]
@@ -90,7 +91,7 @@ def blended_argument(repo: HostRepo, call: graphdeco.CallInSource) -> str:
     "" if there is none, or if several could be it.
     """
     further = sorted(call.arguments - {"dc"})
-    text = "".join(graphdeco.normal_sources(repo, call.package))
+    text = "".join(kernels.normal_sources(repo, call.package))
     return further[0] if len(further) == 1 and _blended(text) else ""
 
 
@@ -144,7 +145,7 @@ def changed_gradients(repo: HostRepo, package: str, setting: str) -> frozenset[s
 def _binding(repo: HostRepo, package: str) -> Iterator[ast.AST]:
     """The Python of a vendored rasterizer, through which hosts call it."""
     name = package.rpartition(".")[2]
-    for folder in graphdeco.vendored(repo, package):
+    for folder in kernels.vendored(repo, package):
         with suppress(SyntaxError):
             yield from ast.walk(ast.parse(repo.read(folder / name / "__init__.py")))
 

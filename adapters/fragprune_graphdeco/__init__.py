@@ -35,9 +35,8 @@ from fragprune_graphdeco.call import (
     read_calls,
 )
 from fragprune_graphdeco.densifying import clones, needy, reaches, splits
-from fragprune_graphdeco.kernels import SURFEL, normal_sources, vendored
-from fragprune_graphdeco.plain import read_models, read_plain, read_selection
-from fragprune_graphdeco.reading import defaults, read_flags, read_getters, training_scripts
+from fragprune_graphdeco.kernels import SURFEL
+from fragprune_graphdeco.plain import read_models
 from fragprune_plugins.adapting import HostRepo, Plain, hookimpl
 
 __all__ = [
@@ -51,23 +50,15 @@ __all__ = [
     "RasterizerCall",
     "clones",
     "default",
-    "defaults",
     "drawing_functions",
     "group_names",
     "model_seam",
     "needy",
-    "normal_sources",
     "optimizers",
     "rasterizer_seam",
     "reaches",
     "read_calls",
-    "read_flags",
-    "read_getters",
-    "read_plain",
-    "read_selection",
     "splits",
-    "training_scripts",
-    "vendored",
 ]
 
 
