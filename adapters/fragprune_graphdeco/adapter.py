@@ -108,6 +108,8 @@ class GraphdecoDialect(Dialect):
         sparse_adam: the revision looks for SparseGaussianAdam in the package.
     """
 
+    otherwise: ClassVar[str] = ""
+    """How the host's own rasterizer is known to draw otherwise than our engines."""
     returned: ClassVar[tuple[str, ...]] = ("image", "radii", "invdepth")
     """What the rasterizer returns, in order; for a name that ``made`` lacks it is None."""
 
@@ -200,6 +202,12 @@ class GraphdecoDialect(Dialect):
         """The values that the call returns: colour (3, H, W), radii (P,) int32, and others."""
         made = self.made(outputs, call)
         return tuple(made.get(name) for name in self.values(call))
+
+    def answer(
+        self, call: HostCall, inputs: RasterInputs, draw: Callable[..., RasterOutputs]
+    ) -> Any:
+        """Draw and pack."""
+        return self.pack(draw(inputs), call)
 
     def names(self) -> frozenset[str]:
         """The import names of the rasterizer and simple_knn, without an import of torch."""

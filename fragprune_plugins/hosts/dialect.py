@@ -93,6 +93,11 @@ class Proof:
 class Prover(ABC):
     """Compares a host's own rasterizer with our engines, for the calls of one dialect."""
 
+    @property
+    def otherwise(self) -> str:
+        """How it is known to draw otherwise than ours; a proof that fails then warns."""
+        return ""
+
     @abstractmethod
     def shape(self, call: HostCall) -> Iterable[Any]:
         """The arguments and rules of a call; one proof covers all calls of the same shape."""
@@ -131,10 +136,6 @@ class Dialect(ABC):
     spares: ClassVar[Mapping[str, Mapping[str, Any]]] = MappingProxyType({})
     """Packages that the host can do without on a CPU, by import name: what it needs of each."""
 
-    otherwise: ClassVar[str] = ""
-    """How the host's own rasterizer is known to draw otherwise than our engines; a proof that fails
-    then warns. "" if nothing is known."""
-
     def unproved(self, repo: HostRepo) -> str:
         """What reading a host cannot show of its pictures; "" if it shows their rule."""
         return "the picture, until it is compared on the first run"
@@ -156,17 +157,11 @@ class Dialect(ABC):
         """
         return None
 
-    def pack(self, outputs: RasterOutputs, call: HostCall) -> Any:
-        """Translate outputs into the tuple that the host expects, None where it reads none.
-
-        A dialect has this, or its own ``answer``.
-        """
-        raise NotImplementedError(f"{type(self).__name__} needs pack() or answer()")
-
+    @abstractmethod
     def answer(
         self, call: HostCall, inputs: RasterInputs, draw: Callable[..., RasterOutputs]
     ) -> Any:
-        """Draw and pack. A dialect may draw several times for one call.
+        """Draw, and translate outputs into what the host expects; perhaps several times.
 
         Args:
             call: the host's call.
@@ -174,7 +169,6 @@ class Dialect(ABC):
             draw: rasterizes inputs with the thresholds of this call. If one call has several
                 cameras, a second argument numbers them from 0.
         """
-        return self.pack(draw(inputs), call)
 
     @abstractmethod
     def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:

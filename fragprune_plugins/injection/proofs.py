@@ -59,12 +59,11 @@ def proved(
         try:
             session.proofs[shape] = _read_or_prove(session, prover, call, drawn, shape)
         except ProofError as error:
-            otherwise = session.dialect.otherwise
-            if strict and not (otherwise or session.trust):
+            if strict and not (prover.otherwise or session.trust):
                 del session.proofs[shape]
                 raise
-            known = f"{error.found}; as known: {otherwise}"
-            log.warning("%s", f"not proved: {known}" if otherwise else error)
+            known = f"{error.found}; as known: {prover.otherwise}"
+            log.warning("%s", f"not proved: {known}" if prover.otherwise else error)
         except (EngineError, InputError) as error:  # raised again where ours has to draw
             log.info("not proved: %s", error)
     return session.proofs[shape]
