@@ -73,6 +73,7 @@ def test_as_text_the_result_comes_first(model, audited, tmp_path):
     assert result.exit_code == 0
     first, *others = result.stdout.splitlines()
     assert re.match(r"60 Gaussians draw [\d.]+ fragments per pixel, [\d.]+ ms a frame", first)
+    assert "a frame of 50x50 pixels" in first
     assert "1 generated view from all around" in first
     assert any(line.startswith("PlayCanvas ") for line in others)
     assert "fragprune finetune" in result.stdout

@@ -324,12 +324,20 @@ class _Survey:
             "views": len(self._overdraw),
             "overdraw": statistics.fmean(self._overdraw),
             **{name: cuts[0][name] for name in same},
+            "frame_size": _sizes(self.shown),
             "engine": self._engine.name,
             "device": str(self._splats.device),
             "idle": self._idle.as_dict(),
             "cuts": cuts,
             "viewers": _viewers(self._asked),
         }
+
+
+def _sizes(timed: Sequence[Shown]) -> str:
+    """WIDTHxHEIGHT of the timed views; of the smallest and the largest, if they differ."""
+    sizes = sorted((*each.fragments.shape,) for each in timed)
+    ends = dict.fromkeys(f"{width}x{height}" for height, width in (sizes[0], sizes[-1]))
+    return " to ".join(ends)
 
 
 def _amid(count: int) -> list[int]:

@@ -57,7 +57,8 @@ def sentence(figures: Mapping[str, Any]) -> str:
     quads = figures["viewers"][0]["shaded_per_pixel"]
     return (
         f"{figures['gaussians']:,} Gaussians draw {figures['fragments_per_pixel']:.1f} fragments "
-        f"per pixel, {figures['frame_ms']:.1f} ms a frame on our {figures['engine']} engine; a "
+        f"per pixel, {figures['frame_ms']:.1f} ms a frame of {figures['frame_size']} pixels on our "
+        f"{figures['engine']} engine; a "
         f"viewer of fixed √8 sigma quads shades {quads:.1f} pixels per pixel. "
         f"{idle['together']:.0%} of the fragments can be left out together, and no pixel "
         f"changes by half an 8-bit level "
@@ -161,7 +162,7 @@ def _tables(figures: Mapping[str, Any]) -> list[page.Table]:
             f"{figures['evaluated_per_pixel'] / max(quads, 1e-9):.2f}",
         ]
     )
-    shaded = f"{_SHADED} Its frames take {figures['frame_ms']:.1f} ms here."
+    shaded = f"{_SHADED} Its frames of {figures['frame_size']} take {figures['frame_ms']:.1f} ms."
     reasons = [
         [
             each["name"],
