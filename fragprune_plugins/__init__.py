@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from fragprune_plugins.workbench.ranks import joined
     from fragprune_plugins.workbench.scenes.cameras import load_cameras
     from fragprune_plugins.workbench.scenes.dataset import load_dataset
+    from fragprune_plugins.workbench.scenes.generated import views_near
     from fragprune_plugins.workbench.scenes.itself import own_pictures, with_own_pictures
 
 __version__ = VERSION
@@ -60,6 +61,7 @@ _NAMES = {
     "workbench.ranks": "joined",
     "workbench.scenes.cameras": "load_cameras",
     "workbench.scenes.dataset": "load_dataset",
+    "workbench.scenes.generated": "views_near",
     "workbench.scenes.itself": "own_pictures with_own_pictures",
 }
 """By module, the names that it gives this package."""
@@ -104,6 +106,7 @@ __all__ = [
     "rasterize",
     "render_view",
     "save",
+    "views_near",
     "whole_of",
     "with_own_pictures",
 ]

@@ -1,6 +1,7 @@
 """Models of one scene beside each other: held-out and training views, elsewhere, and frames.
 
-python full_size.py --data SCENE --first MODEL.ply [--sizes 1 2 4] [--rounds 3] MODEL.ply ...
+python full_size.py --data SCENE --first MODEL.ply [--resolution 1] [--sizes 1 2 4] [--rounds 3]
+                    MODEL.ply ...
 
 MODEL.ply of --first is the model as it came. Prints a row for each other one: PSNR on training and
 held-out views and SSIM on these, fragments per pixel; then how far its pictures are from those of
@@ -26,7 +27,7 @@ from torch import Tensor
 
 from fragprune_plugins.engines import Engine, create_engine
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.hosts.photographs import Photographs
+from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.types import RasterInputs, View
 from fragprune_plugins.workbench.figures.metrics import psnr, ssim
 from fragprune_plugins.workbench.models.model import load
@@ -74,13 +75,14 @@ def main() -> None:
     parser = ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else "")
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--first", type=Path, required=True)
+    parser.add_argument("--resolution", type=int, default=1, help="divides the photographs' sides")
     parser.add_argument("--sizes", type=int, nargs="+", default=[1, 2, 4])
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("models", type=Path, nargs="+")
     args = parser.parse_args()
     torch.set_num_threads(1)
     engine, say = create_engine("cpu"), sys.stdout.write
-    dataset = load_photographs(Photographs(args.data))
+    dataset = load_photographs(Photographs(args.data, Resolution(args.resolution)))
     first, models = load(args.first), {path.stem: load(path) for path in args.models}
     beside = elsewhere(dataset.train)
     shown = [picture(engine, first, view)[0] for view in beside]

@@ -389,7 +389,7 @@ class Stage2:
             order: all views, in the order that they have at every start; that of ``views`` if None.
         """
         self.close()
-        number = {view: index for index, view in enumerate(self._ordered(order))}
+        number = {view: index for index, view in enumerate(order or self._again)}
         tensors = self.store.state_dict()
         plain: dict[str, Any] = {"store": [tensors.pop(name, None) for name in _STORED]}
         for name, figures in (("before", self._before), ("after", self._after)):
@@ -401,9 +401,6 @@ class Stage2:
         plain |= {"expected": self._views.expected, "pressure": numbers_of(self.pressure)}
         plain["target"] = self.target and self.target.state()
         return tensors, plain
-
-    def _ordered(self, order: Iterable[Hashable] | None) -> list[Hashable]:
-        return list(self._again if order is None else order)
 
     def load_state_dict(
         self,
@@ -418,7 +415,7 @@ class Stage2:
             ValueError: a plain value is none that ``state_dict`` gives.
         """
         self.store.load_state_dict(stored_thresholds(tensors, plain))
-        views = self._ordered(order)
+        views = list(order or self._again)
         for name, figures in (("before", self._before), ("after", self._after)):
             for (view, part), figure in zip(plain[name], tensors.get(name, ()), strict=True):
                 figures[views[view], part] = figure

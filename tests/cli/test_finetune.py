@@ -10,6 +10,7 @@ import torch
 from cli.commands import run, run_json
 from finetune import tiny
 
+import fragprune_plugins as fp
 from fragprune_plugins.files import records, sidecar
 from fragprune_plugins.files.ply import read_ply, write_ply
 from fragprune_plugins.learning.pressure import LEAST_PRESSURE
@@ -100,7 +101,8 @@ def test_a_model_that_other_viewers_draw_badly_says_what_to_do(drop, advised):
     ("drop", "more", "advised"),
     [
         (0.04, {}, False),
-        (0.06, {}, True),
+        (0.06, {}, "--self 0.5 --keep 0.7 may"),
+        (0.06, {"keep": 0.6}, "--self 0.5 may"),
         (0.06, {"self": 0.5}, False),
         (0.06, {"target": "itself"}, False),
         (0.06, {"pressure": None}, False),
@@ -108,11 +110,10 @@ def test_a_model_that_other_viewers_draw_badly_says_what_to_do(drop, advised):
     ],
 )
 def test_a_model_that_was_better_as_it_came_can_teach_that(drop, more, advised):
-    data = {"target": "photographs", "self": None, "shards": 1, "pressure": 1e-4}
+    data = {"target": "photographs", "self": None, "keep": None, "shards": 1, "pressure": 1e-4}
     data |= {"before": {"psnr": 30.0}, "after": {"psnr": 30.0 - drop}}
     line = advise_own_pictures(data | {"settings": {"train": "all"}} | more)
-    assert (line is not None) == advised
-    assert not advised or "--self 0.5" in line
+    assert (advised in line) if advised else line is None
 
 
 def test_drops_what_reaches_no_pixel_and_changes_no_picture(scene, tmp_path):
@@ -156,6 +157,23 @@ def test_removes_gaussians_before_learning(scene, tmp_path):
     result = run(*arguments, "--keep", 0.6)
     assert "scoring Gaussians" in result.stderr  # the bar
     assert "Removed 24 of 60 Gaussians before learning" in result.stdout
+
+
+@pytest.mark.parametrize("more", [(), ("--self", 0.5)])
+def test_what_shows_beside_the_photographs_stays(scene, tmp_path, more):
+    data, path, model = scene
+    out = tmp_path / "kept.ply"
+    arguments = ("finetune", path, "--data", data, "--out", out, "--iters", 3, *more)
+    shots = fp.load_dataset(data).train
+    views = fp.views_near(shots)
+    for keep, expected in (
+        (0.7, fp.keep_best(model, 0.7, views)),
+        ("auto", fp.keep_needed(model, shots, views)),
+    ):
+        run_json(*arguments, "--keep", keep, "--train", "opacity")
+        assert torch.equal(read_ply(out).xyz, expected.xyz)
+    alone = fp.keep_best(model, 0.7, [shot.view for shot in shots])
+    assert not torch.equal(alone.xyz, fp.keep_best(model, 0.7, views).xyz)
 
 
 def test_removes_what_photographs_can_spare(scene, tmp_path):

@@ -141,3 +141,18 @@ def test_one_gaussian_stays_even_if_all_can_be_spared(tmp_path, monkeypatch):
     monkeypatch.setattr(scores, "SPARE", 1e9)
     shots = tiny.dataset_in_memory(tmp_path, truth).train
     assert len(scores.keep_needed(truth, shots)) == 1
+
+
+def test_the_budget_is_of_a_view_whichever_views_must_not_change(tmp_path):
+    truth = tiny.random_model()
+    model, shots = tiny.perturbed(truth), tiny.dataset_in_memory(tmp_path, truth).train
+    seen, views = shots[:1], [shot.view for shot in shots]
+    engine = create_engine("auto")
+    left = scores.keep_needed(model, seen, views, engine=engine)
+    inputs = RasterInputs(seen[0].view, model.splats())
+    with torch.no_grad():
+        picture = engine.rasterize(inputs, None).image.clamp(0, 1)
+    allowed = scores.SPARE * float((picture - seen[0].image).square().sum()) * len(views)
+    each = scores.removal_error(model, None, views, engine)
+    assert len(left) == len(model) - int((each.sort().values.cumsum(0) <= allowed).sum())
+    assert len(left) != len(scores.keep_needed(model, seen, engine=engine))

@@ -118,7 +118,8 @@ RULES = (
     metavar="SHARE|auto",
     callback=_share,
     help="Before learning, remove Gaussians until this share is left, such as 0.8: first those "
-    "whose removal changes the training views least. auto keeps what the photographs need. "
+    "whose removal least changes what training views, and others beside them, show. auto keeps "
+    "what the photographs need. "
     "--target-speedup counts from what is left.",
 )
 @click.option("--seed", type=int, default=0, show_default=True, help="Seed of the order of views.")

@@ -189,7 +189,7 @@ class Finetuned:
         if self.keep is not None:
             lines.append(
                 f"Removed {self.removed:,} of {len(self.start.model):,} Gaussians before learning, "
-                "those whose removal changed the training views least."
+                "those whose removal changed the training views and those beside them least."
             )
         if self.dropped:
             why = f"which reach no pixel of the {views} views"
@@ -278,9 +278,10 @@ def advise_own_pictures(data: dict[str, Any]) -> str | None:
     learned = data["pressure"] is not None and data["settings"]["train"] == "all"
     if not (photographs and learned) or data["after"]["psnr"] > data["before"]["psnr"] - LOST:
         return None
+    fewer = " --keep 0.7" if data["keep"] is None else ""
     return (
         "MODEL as it came shows the held-out views better: if it was trained to its end, "
-        "--self 0.5 may lose less."
+        f"--self 0.5{fewer} may lose less."
     )
 
 

@@ -39,6 +39,7 @@ from fragprune_plugins.workbench.pruning.scores import keep_best, keep_needed
 from fragprune_plugins.workbench.pruning.visibility import visible
 from fragprune_plugins.workbench.ranks import Ranks, joined, launched
 from fragprune_plugins.workbench.scenes.dataset import Dataset, load_photographs
+from fragprune_plugins.workbench.scenes.generated import views_near
 from fragprune_plugins.workbench.scenes.itself import with_own_pictures
 
 
@@ -159,7 +160,7 @@ def _learned(opened: _Opened, ranks: Ranks) -> tuple[Finetuned, Engine]:
     if asked.shard:
         whole, engine = part_of(whole, ranks, opened.device), ShardedEngine(engine, ranks)
     start = Candidate(whole, gaussians=count)
-    kept = _keep(whole, asked.keep, opened.dataset.to(opened.device), engine)
+    kept = _keep(whole, asked, opened.dataset.to(opened.device), engine)
     result, found = _learn(kept, opened, engine, ranks)
     saved = result
     if asked.shard:
@@ -207,16 +208,19 @@ def _say(text: str) -> None:
     click.echo(text, err=True)
 
 
-def _keep(
-    whole: Model, keep: float | Literal["auto"] | None, dataset: Dataset, engine: Engine
-) -> Model:
-    """The Gaussians that --keep leaves."""
-    if keep is None:
+def _keep(whole: Model, asked: Asked, dataset: Dataset, engine: Engine) -> Model:
+    """The Gaussians that --keep leaves, for what training views show and cameras beside them."""
+    if asked.keep is None:
         return whole
-    if keep == "auto":
-        return keep_needed(whole, dataset.train, engine=engine, progress=True)
-    views = [shot.view for shot in dataset.train]
-    return keep_best(whole, keep, views, engine=engine, progress=True)
+    if asked.itself == 1:  # own pictures lie between all cameras already
+        shots = dataset.train
+        views = [shot.view for shot in shots]
+    else:
+        shots = [shot for shot in dataset.train if shot.target == "photographs"]
+        views = views_near(shots, seed=asked.seed)
+    if asked.keep == "auto":
+        return keep_needed(whole, shots, views, engine=engine, progress=True)
+    return keep_best(whole, asked.keep, views, engine=engine, progress=True)
 
 
 def _learn(

@@ -19,6 +19,7 @@ from torch import Tensor
 from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.types import View
+from fragprune_plugins.workbench.scenes.dataset import Shot
 from fragprune_plugins.workbench.scenes.posed import HOLD_OUT
 
 Named = list[tuple[str, View]]
@@ -36,6 +37,7 @@ _FOV, _WIDE = 50.0, 75.0  # degrees; rooms are looked at with wide lenses
 _LEVEL = 0.5  # sine of the steepest look from inside: 30 degrees
 _NEIGHBOURS = 4
 _BETWEEN = (0.1, 0.9)  # of the way; nearer to a camera is its own picture again
+_NEAR = 2  # cameras beside each photograph's
 _BESIDE = (-0.6, 0.6)  # of the way; visitors leave the path of the photographs on both sides
 
 
@@ -146,6 +148,17 @@ def beside(cameras: Named, count: int, *, seed: int = 0) -> Named:
         view = interpolate(cameras[i][1], other, stream.uniform(*_BESIDE))
         found.append((f"{cameras[i][0]}~{turn // len(near)}", view))
     return found
+
+
+def views_near(shots: Sequence[Shot], *, seed: int = 0) -> list[View]:
+    """The views of photographs, and twice as many beside them: what a visitor may see.
+
+    Args:
+        shots: the photographs, on one device.
+        seed: of the cameras beside theirs; none if no two photographs look the same way.
+    """
+    named = [(shot.name, shot.view) for shot in shots]
+    return [view for _, view in (*named, *beside(named, _NEAR * len(named), seed=seed))]
 
 
 def _neighbours(cameras: Named) -> list[list[int]]:
