@@ -123,7 +123,7 @@ class GraphdecoDialect(Dialect):
         """Compares any rasterizer that takes these calls."""
         from fragprune_graphdeco.proof import RasterizerProver
 
-        return RasterizerProver(self)
+        return RasterizerProver(self, self.otherwise)
 
     def unproved(self, repo: HostRepo) -> str:
         """Its picture, if the sources of the rasterizer are not vendored."""

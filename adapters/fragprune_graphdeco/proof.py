@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -27,9 +27,6 @@ from fragprune_plugins.adapting import (
     RasterOutputs,
     SeamCall,
 )
-
-if TYPE_CHECKING:
-    from fragprune_graphdeco.adapter import GraphdecoDialect
 
 OF_A_VIEW = frozenset(
     {
@@ -51,12 +48,8 @@ once more. Ours is the derivative, so antialiased calls are not compared in them
 class RasterizerProver(Prover):
     """Compares any rasterizer that takes the calls of a dialect of this family."""
 
-    dialect: GraphdecoDialect
-
-    @property
-    def otherwise(self) -> str:
-        """The dialect's."""
-        return self.dialect.otherwise
+    dialect: Dialect
+    otherwise: str = ""
 
     def shape(self, call: HostCall) -> Iterator[tuple[str, str]]:
         """Which arguments a call has, and every rule that it sets."""

@@ -93,10 +93,8 @@ class Proof:
 class Prover(ABC):
     """Compares a host's own rasterizer with our engines, for the calls of one dialect."""
 
-    @property
-    def otherwise(self) -> str:
-        """How it is known to draw otherwise than ours; a proof that fails then warns."""
-        return ""
+    otherwise: str = ""
+    """How it is known to draw otherwise than ours; a proof that fails then warns."""
 
     @abstractmethod
     def shape(self, call: HostCall) -> Iterable[Any]:
