@@ -31,15 +31,15 @@ def rewrite(root: Path, changes: Mapping[str, Changes], added: type | None = Non
     Args:
         root: the host's folder.
         changes: passages to replace, by file relative to the folder.
-        added: a class; the source of its methods is added to GaussianModel and replaces methods of
-            the same names.
+        added: a class; the source of its methods is added to GaussianModel. They replace methods of
+            the same names, which they can call as ``vanilla_NAME``, without underscores around it.
     """
     for name, passages in changes.items():
         file = root / name
         file.write_text(changed(file.read_text(encoding="utf-8"), passages), encoding="utf-8")
     if added is not None:
         model = root / "scene" / "gaussian_model.py"
-        text = without(model.read_text(encoding="utf-8"), vars(added))
+        text = _renamed(model.read_text(encoding="utf-8"), vars(added))
         model.write_text(f"{text}\n{_body(added)}", encoding="utf-8")
 
 
@@ -51,6 +51,16 @@ def without(text: str, names: Collection[str]) -> str:
             first = min([node.lineno, *(each.lineno for each in node.decorator_list)])
             gone |= set(range(first, (node.end_lineno or first) + 1))
     return "".join(line for number, line in enumerate(lines, 1) if number not in gone)
+
+
+def _renamed(text: str, names: Collection[str]) -> str:
+    """A module's text with other names for the functions, or methods, of these names."""
+    lines = text.splitlines(keepends=True)
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef) and node.name in names:
+            line, new = lines[node.lineno - 1], f"vanilla_{node.name.strip('_')}"
+            lines[node.lineno - 1] = line.replace(f"def {node.name}(", f"def {new}(", 1)
+    return "".join(lines)
 
 
 def _body(kind: type) -> str:

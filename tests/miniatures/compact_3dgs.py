@@ -95,13 +95,8 @@ class Added:
     """Methods of GaussianModel that vanilla does not have, or has otherwise."""
 
     def __init__(self, model):
-        self.active_sh_degree, self.max_sh_degree = 0, 0
-        empty = torch.empty(0)
-        self._xyz, self._scaling, self._rotation = empty, empty, empty
-        self._opacity, self._mask = empty, empty
-        self.max_radii2D, self.xyz_gradient_accum, self.denom = empty, empty, empty
-        self.optimizer, self.percent_dense, self.spatial_lr_scale = None, 0, 0
-        self.setup_functions()
+        self.vanilla_init(0)
+        self._mask = torch.empty(0)
         self.vq_scale = ResidualVQ(3, model.rvq_size, model.rvq_num).cuda()  # noqa: F821
         self.vq_rot = ResidualVQ(4, model.rvq_size, model.rvq_num).cuda()  # noqa: F821
         self.recolor, self.mlp_head = HashGrid(model.max_hashmap), Head()  # noqa: F821
@@ -113,22 +108,8 @@ class Added:
         return self.active_sh_degree, *own, *statistics, state, self.spatial_lr_scale
 
     def create_from_pcd(self, pcd, spatial_lr_scale):
-        self.spatial_lr_scale = spatial_lr_scale
-        points = torch.tensor(np.asarray(pcd.points)).float().cuda()
-        scales = torch.sqrt(torch.clamp_min(distCUDA2(points), 1e-7))  # noqa: F821
-        rotations = torch.zeros((len(points), 4), device="cuda")
-        rotations[:, 0] = 1
-        column = torch.ones((len(points), 1), device="cuda")
-        self._adopt(
-            {
-                "xyz": points,
-                "opacity": inverse_sigmoid(0.1 * column),  # noqa: F821
-                "scaling": self.scaling_inverse_activation(scales)[:, None].repeat(1, 3),
-                "rotation": rotations,
-                "mask": column,
-            }
-        )
-        self.max_radii2D = torch.zeros(len(points), device="cuda")
+        self.vanilla_create_from_pcd(pcd, spatial_lr_scale)
+        self._adopt({"mask": torch.ones_like(self._opacity)})
 
     def training_setup(self, training_args):
         self.percent_dense = training_args.percent_dense
@@ -149,9 +130,7 @@ class Added:
             self.optimizer_net, milestones=training_args.net_lr_step, gamma=0.33
         )
         self.xyz_scheduler_args = get_expon_lr_func(  # noqa: F821
-            rate,
-            training_args.position_lr_final * self.spatial_lr_scale,
-            training_args.position_lr_max_steps,
+            rate, rate / 100, training_args.position_lr_max_steps
         )
 
     def _adopt(self, tensors):
@@ -322,7 +301,7 @@ CHANGES = {
             "from utils.sh_utils import RGB2SH\n",
             "from utils.sh_utils import RGB2SH  # noqa: F401\n\n"
             "from scene.network import HashGrid, Head, ResidualVQ\n",
-        ),
+        )
     ],
     "scene/__init__.py": [
         (

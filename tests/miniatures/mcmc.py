@@ -166,7 +166,7 @@ CHANGES = {
             "from utils.sh_utils import RGB2SH\n",
             "from utils.reloc_utils import compute_relocation_cuda\n"
             "from utils.sh_utils import RGB2SH\n",
-        ),
+        )
     ],
     "train.py": [
         (

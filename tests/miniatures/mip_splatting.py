@@ -39,72 +39,46 @@ class Added:
         self.filter_3D = (nearest * math.sqrt(0.2))[:, None]
 
     def _reset_statistics(self):
-        shape = (self.get_xyz.shape[0], 1)
-        self.xyz_gradient_accum = torch.zeros(shape, device="cuda")
-        self.xyz_gradient_accum_abs = torch.zeros(shape, device="cuda")
-        self.xyz_gradient_accum_abs_max = torch.zeros(shape, device="cuda")
-        self.denom = torch.zeros(shape, device="cuda")
+        self.vanilla_reset_statistics()
+        self.xyz_gradient_accum_abs = torch.zeros_like(self.denom)
+        self.xyz_gradient_accum_abs_max = torch.zeros_like(self.denom)
 
     def prune_points(self, mask):
-        keep = ~mask
-        self._adopt(self._prune_optimizer(keep))
-        for name in ("", "_abs", "_abs_max"):
-            name = f"xyz_gradient_accum{name}"
-            setattr(self, name, getattr(self, name)[keep])
-        self.denom, self.max_radii2D = self.denom[keep], self.max_radii2D[keep]
+        self.vanilla_prune_points(mask)
+        for name in ("xyz_gradient_accum_abs", "xyz_gradient_accum_abs_max"):
+            setattr(self, name, getattr(self, name)[~mask])
 
     def add_densification_stats(self, viewspace_point_tensor, update_filter):
+        self.vanilla_add_densification_stats(viewspace_point_tensor, update_filter)
         grad = viewspace_point_tensor.grad[update_filter]
-        self.xyz_gradient_accum[update_filter] += grad[:, :2].norm(dim=1, keepdim=True)
         self.xyz_gradient_accum_abs[update_filter] += grad[:, 2:].norm(dim=1, keepdim=True)
-        self.denom[update_filter] += 1
 
-    def _both(self, grads, grad_threshold, grads_abs, grad_abs_threshold, scene_extent, large):
-        moved = self._needy(grads, grad_threshold, scene_extent, large)
-        return moved | self._needy(grads_abs, grad_abs_threshold, scene_extent, large)
+    def _needy(self, grads, grad_threshold, scene_extent, large):
+        moved = self.vanilla_needy(grads, grad_threshold, scene_extent, large)
+        return moved | self.vanilla_needy(*self._absolute, scene_extent, large)
 
     def densify_and_clone(self, grads, grad_threshold, grads_abs, grad_abs_threshold, scene_extent):
-        given = (grads, grad_threshold, grads_abs, grad_abs_threshold, scene_extent)
-        chosen = self._both(*given, large=False)
-        own = (self._xyz, self._features_dc, self._features_rest)
-        own = (*own, self._opacity, self._scaling, self._rotation)
-        self.densification_postfix(*(tensor[chosen] for tensor in own))
+        self._absolute = grads_abs, grad_abs_threshold
+        self.vanilla_densify_and_clone(grads, grad_threshold, scene_extent)
 
     def densify_and_split(
         self, grads, grad_threshold, grads_abs, grad_abs_threshold, scene_extent, N=2
     ):
-        given = (grads, grad_threshold, grads_abs, grad_abs_threshold, scene_extent)
-        chosen = self._both(*given, large=True)
-        spread = self.get_scaling[chosen].repeat(N, 1)
-        turn = build_rotation(self._rotation[chosen]).repeat(N, 1, 1)  # noqa: F821
-        offset = (turn @ torch.normal(torch.zeros_like(spread), spread)[..., None])[..., 0]
-        self.densification_postfix(
-            self.get_xyz[chosen].repeat(N, 1) + offset,
-            self._features_dc[chosen].repeat(N, 1, 1),
-            self._features_rest[chosen].repeat(N, 1, 1),
-            self._opacity[chosen].repeat(N, 1),
-            self.scaling_inverse_activation(spread / (0.8 * N)),
-            self._rotation[chosen].repeat(N, 1),
-        )
-        children = torch.zeros(len(spread), dtype=torch.bool, device="cuda")
-        self.prune_points(torch.cat((chosen, children)))
+        self._absolute = grads_abs, grad_abs_threshold
+        self.vanilla_densify_and_split(grads, grad_threshold, scene_extent, N)
 
     def densify_and_prune(self, max_grad, min_opacity, extent, max_screen_size):
         grads = (self.xyz_gradient_accum / self.denom).nan_to_num(0.0)
         grads_abs = (self.xyz_gradient_accum_abs / self.denom).nan_to_num(0.0)
         share = (grads >= max_grad).float().mean()
         quantile = torch.quantile(grads_abs.reshape(-1), 1 - share)
-        counts = [len(self._xyz)]
         self.densify_and_clone(grads, max_grad, grads_abs, quantile, extent)
-        counts.append(len(self._xyz))
         self.densify_and_split(grads, max_grad, grads_abs, quantile, extent)
-        counts.append(len(self._xyz))
         unwanted = (self.get_opacity < min_opacity).squeeze(-1)
         if max_screen_size:
             unwanted |= self.max_radii2D > max_screen_size
             unwanted |= self.get_scaling.max(dim=1).values > 0.1 * extent
         self.prune_points(unwanted)
-        return counts[1] - counts[0], counts[2] - counts[1], counts[2] - len(self._xyz)
 
     def reset_opacity(self):
         low = self.get_opacity_with_3D_filter.clamp_max(0.01) / self._dimming()
@@ -136,7 +110,7 @@ class Added:
         self._write(path, table, self.construct_list_of_attributes())
 
     def load_ply(self, path):
-        self._load_vanilla(path)
+        self.vanilla_load_ply(path)
         column = np.asarray(PlyData.read(path)["vertex"]["filter_3D"])[:, None]
         self.filter_3D = torch.tensor(column, dtype=torch.float, device="cuda")
 
@@ -148,7 +122,7 @@ CHANGES = {
             "        self.eval = False\n"
             "        self._kernel_size = 0.1\n"
             "        self.ray_jitter = False\n",
-        ),
+        )
     ],
     "gaussian_renderer/__init__.py": [
         ("    bg_color: torch.Tensor,\n", "    bg_color: torch.Tensor,\n    kernel_size: float,\n"),
@@ -169,20 +143,7 @@ CHANGES = {
         ("scales=pc.get_scaling,", "scales=pc.get_scaling_with_3D_filter,"),
         ("opacities=pc.get_opacity,", "opacities=pc.get_opacity_with_3D_filter,"),
     ],
-    "scene/gaussian_model.py": [
-        ("import numpy as np\n", "import math\n\nimport numpy as np\n"),
-        ("    def load_ply(", "    def _load_vanilla("),
-        *(
-            (f"    def {name}(", f"    def _vanilla{index}(")
-            for index, name in enumerate(
-                (
-                    *("_reset_statistics", "prune_points", "add_densification_stats"),
-                    *("densify_and_clone", "densify_and_split", "densify_and_prune"),
-                    *("reset_opacity", "save_ply"),
-                )
-            )
-        ),
-    ],
+    "scene/gaussian_model.py": [("import numpy as np\n", "import math\n\nimport numpy as np\n")],
     "train.py": [
         ("import torch\n", "import open3d as o3d  # noqa: F401\nimport torch\n"),
         (
@@ -218,10 +179,7 @@ CHANGES = {
         ),
     ],
     "render.py": [
-        (
-            "pipeline, background)[",
-            "pipeline, background, kernel_size)[",
-        ),
+        ("pipeline, background)[", "pipeline, background, kernel_size)["),
         ("gaussians, pipeline, background):", "gaussians, pipeline, background, kernel_size):"),
         (
             "gaussians, pipeline, background)\n",

@@ -16,106 +16,47 @@ class Added:
     """Methods of GaussianModel that vanilla does not have, or has otherwise."""
 
     def __init__(self, sh_degree, args):
-        self.active_sh_degree, self.max_sh_degree = 0, sh_degree
+        self.vanilla_init(sh_degree)
         self._deformation = deform_network(args)  # noqa: F821 - imported where this is put
-        empty = torch.empty(0)
-        self._xyz, self._features_dc, self._features_rest = empty, empty, empty
-        self._scaling, self._rotation, self._opacity = empty, empty, empty
-        self.max_radii2D, self.xyz_gradient_accum, self.denom = empty, empty, empty
-        self._deformation_table, self.spatial_lr_scale = empty, 0
-        self.optimizer, self.percent_dense = None, 0
-        self.setup_functions()
+        self._deformation_table = torch.empty(0)
 
     def capture(self):
-        return (
-            self.active_sh_degree,
-            self._xyz,
-            self._deformation.state_dict(),
-            self._deformation_table,
-            self._features_dc,
-            self._features_rest,
-            self._scaling,
-            self._rotation,
-            self._opacity,
-            self.max_radii2D,
-            self.xyz_gradient_accum,
-            self.denom,
-            self.optimizer.state_dict(),
-            self.spatial_lr_scale,
-        )
+        degree, xyz, *others = self.vanilla_capture()
+        return degree, xyz, self._deformation.state_dict(), self._deformation_table, *others
 
     def restore(self, model_args, training_args):
-        self.active_sh_degree, self._xyz, network, self._deformation_table = model_args[:4]
-        self._features_dc, self._features_rest, self._scaling, self._rotation = model_args[4:8]
-        self._opacity, self.max_radii2D, accumulated, denominator = model_args[8:12]
-        optimizer_state, self.spatial_lr_scale = model_args[12:]
+        degree, xyz, network, self._deformation_table, *others = model_args
         self._deformation.load_state_dict(network)
-        self.training_setup(training_args)
-        self.xyz_gradient_accum, self.denom = accumulated, denominator
-        self.optimizer.load_state_dict(optimizer_state)
+        self.vanilla_restore((degree, xyz, *others), training_args)
 
     def create_from_pcd(self, pcd, spatial_lr_scale, time_line):
-        points = torch.tensor(np.asarray(pcd.points)).float()  # noqa: F821
-        colours = RGB2SH(torch.tensor(np.asarray(pcd.colors)).float())  # noqa: F821
-        self.spatial_lr_scale, n = spatial_lr_scale, len(points)
-        width = torch.sqrt(torch.clamp_min(distCUDA2(points), 1e-7))  # noqa: F821
-        self._adopt(
-            {
-                "xyz": points,
-                "f_dc": colours[:, None, :],
-                "f_rest": torch.zeros(n, (self.max_sh_degree + 1) ** 2 - 1, 3),
-                "opacity": torch.full((n, 1), -2.197),
-                "scaling": width.log()[:, None].repeat(1, 3),
-                "rotation": torch.eye(1, 4).repeat(n, 1),
-            }
-        )
-        self.max_radii2D = torch.zeros(n)
-        self._deformation_table = torch.ones(n, dtype=torch.bool)
+        self.vanilla_create_from_pcd(pcd, spatial_lr_scale)
+        self._deformation_table = torch.ones(len(self._xyz), dtype=torch.bool)
 
     def training_setup(self, training_args):
-        self.percent_dense = training_args.percent_dense
-        self._reset_statistics()
-        extent, network = self.spatial_lr_scale, self._deformation
-        groups = [
-            {
-                "params": [self._xyz],
-                "lr": training_args.position_lr_init * extent,
-                "name": "xyz",
-            },
-            {
-                "params": list(network.get_mlp_parameters()),
-                "lr": training_args.deformation_lr_init * extent,
-                "name": "deformation",
-            },
-            {
-                "params": list(network.get_grid_parameters()),
-                "lr": training_args.grid_lr_init * extent,
-                "name": "grid",
-            },
-            {"params": [self._features_dc], "lr": training_args.feature_lr, "name": "f_dc"},
-            {
-                "params": [self._features_rest],
-                "lr": training_args.feature_lr / 20,
-                "name": "f_rest",
-            },
-            {"params": [self._opacity], "lr": training_args.opacity_lr, "name": "opacity"},
-            {"params": [self._scaling], "lr": training_args.scaling_lr, "name": "scaling"},
-            {"params": [self._rotation], "lr": training_args.rotation_lr, "name": "rotation"},
+        self.vanilla_training_setup(training_args)
+        given, extent = vars(training_args), self.spatial_lr_scale
+        own = {
+            "deformation": list(self._deformation.get_mlp_parameters()),
+            "grid": list(self._deformation.get_grid_parameters()),
+        }
+        more = [
+            {"params": own[name], "lr": given[f"{name}_lr_init"] * extent, "name": name}
+            for name in own
         ]
-        self.optimizer = torch.optim.Adam(groups, lr=0.0, eps=1e-15)
+        xyz, *others = self.optimizer.param_groups
+        self.optimizer = torch.optim.Adam([xyz, *more, *others], lr=0.0, eps=1e-15)
         self.schedules = {
             name: get_expon_lr_func(  # noqa: F821
-                first * extent, last * extent, training_args.position_lr_max_steps
+                given[f"{rate}_lr_init"] * extent,
+                given[f"{rate}_lr_final"] * extent,
+                training_args.position_lr_max_steps,
             )
-            for name, first, last in (
-                ("xyz", training_args.position_lr_init, training_args.position_lr_final),
-                (
-                    "deformation",
-                    training_args.deformation_lr_init,
-                    training_args.deformation_lr_final,
-                ),
-                ("grid", training_args.grid_lr_init, training_args.grid_lr_final),
-            )
+            for name, rate in {
+                "xyz": "position",
+                "deformation": "deformation",
+                "grid": "grid",
+            }.items()
         }
 
     def update_learning_rate(self, iteration):
@@ -158,17 +99,13 @@ class Added:
         return grown
 
     def _reset_statistics(self):
-        n = self.get_xyz.shape[0]
-        self.xyz_gradient_accum, self.denom = torch.zeros((n, 1)), torch.zeros((n, 1))
-        self._deformation_accum = torch.zeros((n, 3))
+        self.vanilla_reset_statistics()
+        self._deformation_accum = torch.zeros((len(self._xyz), 3))
 
     def prune_points(self, mask):
-        keep = ~mask
-        self._adopt(self._prune_optimizer(keep))
-        for name in ("xyz_gradient_accum", "denom", "max_radii2D"):
-            setattr(self, name, getattr(self, name)[keep])
+        self.vanilla_prune_points(mask)
         for name in ("_deformation_table", "_deformation_accum"):
-            setattr(self, name, getattr(self, name)[keep])
+            setattr(self, name, getattr(self, name)[~mask])
 
     def densification_postfix(
         self,
@@ -180,18 +117,9 @@ class Added:
         new_rotation,
         new_deformation_table,
     ):
-        new = {
-            "xyz": new_xyz,
-            "f_dc": new_features_dc,
-            "f_rest": new_features_rest,
-            "opacity": new_opacities,
-            "scaling": new_scaling,
-            "rotation": new_rotation,
-        }
-        self._adopt(self.cat_tensors_to_optimizer(new))
+        new = (new_xyz, new_features_dc, new_features_rest, new_opacities, new_scaling)
+        self.vanilla_densification_postfix(*new, new_rotation)
         self._deformation_table = torch.cat([self._deformation_table, new_deformation_table])
-        self._reset_statistics()
-        self.max_radii2D = torch.zeros(self.get_xyz.shape[0])
 
     def _rows(self, chosen, copies=1):
         names = ("_xyz", "_features_dc", "_features_rest", "_opacity", "_scaling", "_rotation")

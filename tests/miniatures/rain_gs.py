@@ -27,7 +27,7 @@ class Added:
                 self._scaling[chosen].repeat(N - 1, 1),
                 self._rotation[chosen].repeat(N - 1, 1),
             )
-        self._split_near(grads, grad_threshold, scene_extent, N)
+        self.vanilla_densify_and_split(grads, grad_threshold, scene_extent, N)
 
     def densify_and_prune(
         self, max_grad, min_opacity, extent, max_screen_size, N=2, abe_split=False
@@ -99,8 +99,6 @@ CHANGES = {
             "    def __init__(self, sh_degree: int, divide_ratio):\n"
             "        self.divide_ratio = divide_ratio\n",
         ),
-        ("    def densify_and_split(", "    def _split_near("),
-        ("    def densify_and_prune(", "    def _vanilla_densify_and_prune("),
         ("spread / (0.8 * N)", "spread / (self.divide_ratio * N)"),
     ],
     "scene/__init__.py": [

@@ -37,48 +37,26 @@ class Added:
         sh_degree_t=0,
         prefilter_var=-1.0,
     ):
-        self.active_sh_degree, self.max_sh_degree = 0, sh_degree
+        self.vanilla_init(sh_degree)
         self.active_sh_degree_t, self.max_sh_degree_t = 0, sh_degree_t
         self.gaussian_dim, self.time_duration, self.rot_4d = gaussian_dim, time_duration, rot_4d
         self.force_sh_3d, self.prefilter_var = force_sh_3d, prefilter_var
-        for name in ATTRIBUTES.values():
-            setattr(self, name, torch.empty(0))
-        self.max_radii2D, self.xyz_gradient_accum = torch.empty(0), torch.empty(0)
-        self.t_gradient_accum, self.denom, self.env_map = (torch.empty(0),) * 3
-        self.optimizer, self.percent_dense, self.spatial_lr_scale = None, 0, 0
-        self.setup_functions()
+        self._t, self._scaling_t, self._rotation_r = (torch.empty(0),) * 3
+        self.t_gradient_accum, self.env_map = torch.empty(0), torch.empty(0)
 
     def capture(self):
-        space = (
-            self.active_sh_degree,
-            self._xyz,
-            self._features_dc,
-            self._features_rest,
-            self._scaling,
-            self._rotation,
-            self._opacity,
-            self.max_radii2D,
-            self.xyz_gradient_accum,
-        )
-        state = (self.denom, self.optimizer.state_dict(), self.spatial_lr_scale)
+        space = self.vanilla_capture()
         if self.gaussian_dim == 3:
-            return (*space, *state)
+            return space
         time = (self._t, self._scaling_t, self._rotation_r, self.rot_4d, self.env_map)
-        return (*space, self.t_gradient_accum, *state, *time, self.active_sh_degree_t)
+        return (*space[:9], self.t_gradient_accum, *space[9:], *time, self.active_sh_degree_t)
 
     def restore(self, model_args, training_args):
-        (self.active_sh_degree, self._xyz, self._features_dc, self._features_rest) = model_args[:4]
-        self._scaling, self._rotation, self._opacity, self.max_radii2D = model_args[4:8]
-        if self.gaussian_dim == 4:
-            self.spatial_lr_scale = model_args[12]
-            (self._t, self._scaling_t, self._rotation_r, self.rot_4d) = model_args[13:17]
-            self.env_map, self.active_sh_degree_t = model_args[17:]
-            accumulated, in_time, denominator, optimizer_state = model_args[8:12]
-        if training_args is not None:
-            self.training_setup(training_args)
-            self.xyz_gradient_accum, self.t_gradient_accum = accumulated, in_time
-            self.denom = denominator
-            self.optimizer.load_state_dict(optimizer_state)
+        space, (in_time, *state), time = model_args[:9], model_args[9:13], model_args[13:]
+        self._t, self._scaling_t, self._rotation_r, self.rot_4d = time[:4]
+        self.env_map, self.active_sh_degree_t = time[4:]
+        self.vanilla_restore((*space, *state), training_args)
+        self.t_gradient_accum = in_time
 
     def _names(self):
         many = 6 if self.gaussian_dim == 3 else 9 if self.rot_4d else 8
@@ -91,48 +69,32 @@ class Added:
             setattr(self, ATTRIBUTES[name], parameter)
 
     def _reset_statistics(self):
-        n = self.get_xyz.shape[0]
-        self.xyz_gradient_accum, self.denom = torch.zeros((n, 1)), torch.zeros((n, 1))
-        self.t_gradient_accum = torch.zeros((n, 1))
+        self.vanilla_reset_statistics()
+        self.t_gradient_accum = torch.zeros_like(self.denom)
 
     def create_from_pcd(self, pcd, spatial_lr_scale):
-        points = torch.tensor(np.asarray(pcd.points)).float()  # noqa: F821
-        colours = RGB2SH(torch.tensor(np.asarray(pcd.colors)).float())  # noqa: F821
-        self.spatial_lr_scale, n = spatial_lr_scale, len(points)
-        width = torch.sqrt(torch.clamp_min(distCUDA2(points), 1e-7))  # noqa: F821
-        still = torch.eye(1, 4).repeat(n, 1)
-        start, end = self.time_duration
+        self.vanilla_create_from_pcd(pcd, spatial_lr_scale)
+        n, (start, end) = len(self._xyz), self.time_duration
         given = getattr(pcd, "time", None)
         times = torch.rand(n, 1) if given is None else (torch.tensor(given).float() - start)
         values = {
-            "xyz": points,
-            "f_dc": colours[:, None, :],
             "f_rest": torch.zeros(n, self.get_max_sh_channels - 1, 3),
-            "opacity": torch.full((n, 1), -2.197),
-            "scaling": width.log()[:, None].repeat(1, 3),
-            "rotation": still,
             "t": start + (end - start) * times,
             "scaling_t": torch.full((n, 1), ((end - start) / 5) ** 0.5).log(),
-            "rotation_r": still.clone(),
+            "rotation_r": torch.eye(1, 4).repeat(n, 1),
         }
-        self._adopt({name: values[name] for name in self._names()})
-        self.max_radii2D = torch.zeros(n)
+        self._adopt({name: values[name] for name in self._names() if name in values})
 
     def training_setup(self, training_args):
-        self.percent_dense = training_args.percent_dense
-        self._reset_statistics()
-        rates = [training_args.position_lr_init * self.spatial_lr_scale, training_args.feature_lr]
-        rates += [training_args.feature_lr / 20, training_args.opacity_lr]
-        rates += [training_args.scaling_lr, training_args.rotation_lr, rates[0]]
-        rates += [training_args.scaling_lr, training_args.rotation_lr]
-        groups = [
-            {"params": [getattr(self, ATTRIBUTES[name])], "lr": rate, "name": name}
-            for name, rate in zip(self._names(), rates, strict=False)
-        ]
-        self.optimizer = torch.optim.Adam(groups, lr=0.0, eps=1e-15)
-        self.xyz_scheduler_args = get_expon_lr_func(  # noqa: F821
-            rates[0], rates[0] / 100, training_args.position_lr_max_steps
-        )
+        self.vanilla_training_setup(training_args)
+        rates = {
+            "t": training_args.position_lr_init * self.spatial_lr_scale,
+            "scaling_t": training_args.scaling_lr,
+            "rotation_r": training_args.rotation_lr,
+        }
+        for name in self._names()[6:]:
+            group = {"params": [getattr(self, ATTRIBUTES[name])], "lr": rates[name], "name": name}
+            self.optimizer.add_param_group(group)
 
     @property
     def get_max_sh_channels(self):
@@ -242,18 +204,13 @@ class Added:
         self.prune_points(unwanted)
 
     def prune_points(self, mask):
-        keep = ~mask
-        self._adopt(self._prune_optimizer(keep))
-        self.xyz_gradient_accum = self.xyz_gradient_accum[keep]
-        self.t_gradient_accum = self.t_gradient_accum[keep]
-        self.denom, self.max_radii2D = self.denom[keep], self.max_radii2D[keep]
+        self.vanilla_prune_points(mask)
+        self.t_gradient_accum = self.t_gradient_accum[~mask]
 
     def add_densification_stats(self, viewspace_point_tensor, update_filter, avg_t_grad=None):
-        moved = torch.norm(viewspace_point_tensor.grad[update_filter, :2], dim=-1, keepdim=True)
-        self.xyz_gradient_accum[update_filter] += moved
+        self.vanilla_add_densification_stats(viewspace_point_tensor, update_filter)
         if self.gaussian_dim == 4:
             self.t_gradient_accum[update_filter] += avg_t_grad[update_filter]
-        self.denom[update_filter] += 1
 
 
 RASTERIZER = '''"""Compiles itself when it is imported, where there is a compiler."""

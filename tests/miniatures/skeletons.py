@@ -10,10 +10,7 @@ SETTINGS = [
     *("viewmatrix", "projmatrix", "sh_degree", "campos", "prefiltered", "debug"),
 ]
 
-GETTERS = {
-    "get_xyz": "self._xyz",
-    "get_opacity": "self.opacity_activation(self._opacity)",
-}
+GETTERS = {"get_xyz": "self._xyz", "get_opacity": "self.opacity_activation(self._opacity)"}
 
 FLAGS = """
 def read_flags(parser):

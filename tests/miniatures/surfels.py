@@ -91,7 +91,7 @@ CHANGES = {
             "        far = package['rend_dist'].mean()\n"
             "        loss = loss + (opt.lambda_dist if iteration > 3 else 0) * far\n"
             "        loss.backward()\n",
-        ),
+        )
     ],
 }
 
