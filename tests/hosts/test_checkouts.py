@@ -1,47 +1,51 @@
 """Real checkouts, unmodified, where ``FRAGPRUNE_HOSTS`` points at a folder of them.
 
-None is kept here: their licence is not ours. ``FRAGPRUNE_TEST_DATA`` may name a folder that holds
-``fox/colmap160``, or is itself a COLMAP dataset; otherwise the demo's room is photographed.
+None is kept here: their licence is not ours. The conformance kit tries each adapter on its
+checkouts; these tests run the hosts' own training scripts. ``FRAGPRUNE_TEST_DATA`` may name a
+folder that holds ``fox/colmap160``, or is itself a COLMAP dataset; otherwise the demo's room is
+photographed.
 """
 
 import json
 import os
-import shutil
+import re
+import subprocess
+import sys
+from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+from hosts.training import STEPS, learned
 from miniatures.skeletons import STATES
 
-from fragprune_2dgs import SurfelSplatting
-from fragprune_mcmc import MCMC
-from fragprune_mip_splatting import MipSplatting
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.testing.conformance import found_adapter
-from fragprune_rain_gs import RainGS
+from fragprune_plugins.testing.fresh import fresh
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 FOLDER = os.environ.get("FRAGPRUNE_HOSTS")
+HOW_TO = Path(__file__).parents[2] / "docs" / "how-to"
 
 
-def checkouts(*adapters) -> list[Path]:
-    """Folders that one of the adapters is for."""
+def checkouts(name: str) -> list[Path]:
+    """Folders that an adapter is for."""
     found = sorted(path for path in Path(FOLDER).iterdir() if path.is_dir()) if FOLDER else []
-    return [p for p in found if any(adapter.match(HostRepo(p)).fits for adapter in adapters)]
+    return [path for path in found if found_adapter(name).match(HostRepo(path)).fits]
 
 
-def each_of(*adapters):
-    """A test for every checkout that one of the adapters is for."""
-    titles = " or ".join(adapter.info.title for adapter in adapters)
-    reason = f"FRAGPRUNE_HOSTS names no folder with a checkout of {titles} in it"
-    hosts = checkouts(*adapters) or [pytest.param(None, marks=pytest.mark.skip(reason=reason))]
-    return pytest.mark.parametrize("host", hosts, ids=lambda path: path.name if path else "none")
+def each_of(name: str, *more: object) -> list:
+    """Parameters of a test for every checkout of an adapter; one that is skipped if there is none.
 
-
-every_vanilla = each_of(Vanilla3DGS())
-every_host = each_of(Vanilla3DGS(), MCMC(), MipSplatting(), RainGS(), SurfelSplatting())
-every_renderer = each_of(Vanilla3DGS(), MCMC(), MipSplatting())  # RAIN-GS's fails by itself
+    Args:
+        name: the adapter's.
+        more: further parameters.
+    """
+    reason = f"FRAGPRUNE_HOSTS names no folder with a checkout of {name} in it"
+    none = pytest.param(None, *more, marks=pytest.mark.skip(reason=reason), id=f"no {name}")
+    return [pytest.param(path, *more, id=path.name) for path in checkouts(name)] or [none]
 
 
 DIALECTS = {  # settings, and values that come back
@@ -56,17 +60,18 @@ DIALECTS = {  # settings, and values that come back
 }
 
 
-@pytest.mark.parametrize("name", DIALECTS)
-def test_every_dialect_is_read_and_vanillas_adapter_keeps_out(name):
-    adapter = found_adapter(name)
-    hosts = checkouts(adapter)
-    if not hosts:
-        pytest.skip(f"FRAGPRUNE_HOSTS names no folder with a checkout of {name} in it")
-    for repo in map(HostRepo, hosts):
-        dialect = adapter.dialect(repo)
-        assert (len(dialect.settings), dialect.outputs) == DIALECTS[name]
-        assert adapter.command_line(repo).default_iterations == 30_000
-        assert not Vanilla3DGS().match(repo).fits
+@pytest.mark.parametrize(
+    ("host", "name"), [case for name in DIALECTS for case in each_of(name, name)]
+)
+def test_every_dialect_is_read_and_vanillas_adapter_keeps_out(host, name):
+    adapter, repo = found_adapter(name), HostRepo(host)
+    dialect = adapter.dialect(repo)
+    assert (len(dialect.settings), dialect.outputs) == DIALECTS[name]
+    assert adapter.command_line(repo).default_iterations == 30_000
+    assert not Vanilla3DGS().match(repo).fits
+
+
+every_vanilla = pytest.mark.parametrize("host", each_of("vanilla-3dgs"))
 
 
 @every_vanilla
@@ -81,137 +86,167 @@ def test_the_state_of_vanilla_is_a_known_one(host):
     assert adapter.command_line(repo).default_iterations == 30_000
 
 
-def flags(host: Path) -> list[str]:
-    """What a host needs, or refuses, beyond the flags that all have."""
-    repo = HostRepo(host)
-    if MCMC().match(repo).fits:
-        return ["--cap_max", "3100", "--init_type", "sfm"]
-    return ["--port", "0", *(["--exp_name", "a"] if RainGS().match(repo).fits else [])]
+@dataclass(frozen=True)
+class Training:
+    """How a host is trained in these tests.
+
+    Attributes:
+        flags: what the host needs beside ``FLAGS``.
+        script: that trains.
+        needs: packages that the host imports.
+        data: fixture with its photographs.
+        checkpoint: of the iteration after which the host's training ends in an error of its own.
+    """
+
+    flags: str = "--port 0"
+    script: str = "train.py"
+    needs: tuple[str, ...] = ()
+    data: str = "dataset"
+    checkpoint: int = 0
 
 
-TORCHVISION = """
-import sys
-from types import ModuleType
-try:
-    import torchvision
-except Exception:  # it is not made for every torch; only pictures and LPIPS need it
-    from PIL import Image
-    package, tools = ModuleType("torchvision"), ModuleType("torchvision.utils")
-    package.__path__, package.models = [], None
-    def save_image(tensor, path):
-        pixels = (tensor.detach().clamp(0, 1) * 255).byte().permute(1, 2, 0)
-        Image.fromarray(pixels.cpu().numpy()).save(path)
-    tools.save_image, package.utils = save_image, tools
-    sys.modules.update({"torchvision": package, "torchvision.utils": tools})
-"""
-
-RUN = (
-    TORCHVISION
-    + """
-import contextlib, json
-from dataclasses import replace
-from pathlib import Path
-import torch
-torch.set_num_threads(1)
-from fragprune_plugins.files import sidecar
-from fragprune_plugins.injection.launch import RunOptions, run
-from fragprune_plugins.files.ply import read_ply
-from fragprune_plugins.learning.schedule import Settings
-
-host, data, out = (Path(argument) for argument in sys.argv[1:4])
-train = sys.argv[4]
-words = [str(host / "train.py"), "-s", str(data), "-m", str(out), "--eval", "-r", "1"]
-words += "--iterations 30 --sh_degree 1 --densify_from_iter 5 --densification_interval 10".split()
-words += "--densify_until_iter 25 --densify_grad_threshold 0.002 --test_iterations -1".split()
-words += sys.argv[5:]
-options = RunOptions(
-    device="cpu", settings=Settings(iterations=10, train=train, threshold_lr=0.3)
-)
-with contextlib.redirect_stdout(sys.stderr):
-    summary = run(words, replace(options))
-    paths = (summary.model_before, summary.model_after)
-    before, after = (read_ply(path, filtered=True) for path in paths)
-    store, info = sidecar.load(summary.model_after)
-    moved = [
-        name
-        for name in ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
-        if not torch.equal(getattr(before, name), getattr(after, name))
-    ]
-    report = {
-        "moved": moved,
-        "rows": [len(before.xyz), len(after.xyz), len(store), info.rows],
-        "steps": [summary.iterations, store.steps],
-        "neutral": store.neutral,
-        "fragments": [summary.fragments_before, summary.fragments_after],
-    }
-print(json.dumps(report))
-"""
-)
-
-MOVES = {  # f_rest is not drawn yet: hosts use a second band from iteration 1000 on
-    "opacity": ["opacity"],
-    "appearance": ["f_dc", "opacity"],
-    "all": ["xyz", "f_dc", "opacity", "scaling", "rotation"],
+FLAGS = """-s {data} -m {out} --eval -r 1 --sh_degree 1 --test_iterations -1
+--iterations 30 --densify_from_iter 5 --densification_interval 10 --densify_until_iter 25
+--densify_grad_threshold 0.002"""
+MOVING = """-s {data} -m {out} --iterations 14 --coarse_iterations 6 --densify_from_iter 2
+--densification_interval 4 --densify_until_iter 12 --densify_grad_threshold_coarse 0.0002
+--test_iterations -1 --port 0"""
+DRAWS = ("torchvision",)
+TRAININGS = {
+    "vanilla-3dgs": [Training()],
+    "2dgs": [Training()],
+    "mcmc": [Training("--cap_max 3100 --init_type sfm")],
+    "mip-splatting": [Training()],
+    "rain-gs": [Training("--port 0 --exp_name a")],
+    "light-gaussian": [
+        Training("--port 0 --prune_iterations 20 33", script="train_densify_prune.py")
+    ],
+    "mini-splatting": [
+        Training(script="gs/train.py"),
+        Training("--port 0 --imp_metric outdoor", script="ms/train.py"),
+        Training(script="ms_d/train.py"),
+    ],
+    "speedy-splat": [Training(needs=DRAWS)],
+    "lp-3dgs": [
+        Training(f"--port 0 --prune_method {method}", needs=DRAWS, checkpoint=30)
+        for method in ("3dgs", "mini_splatting", "rad_splat")
+    ],
 }
 
 
-@every_host
-@pytest.mark.parametrize("train", MOVES)
-def test_training_then_fine_tuning_moves_only_what_is_named(host, dataset, tmp_path, python, train):
-    report = python(RUN, host, dataset, tmp_path / "out", train, *flags(host))
-    assert report["moved"] == MOVES[train]
-    assert len(set(report["rows"])) == 1
-    assert report["steps"] == [10, 10]
-    assert not report["neutral"]
-    before, after = report["fragments"]
+def expect_opacities_moved_alone(found):
+    assert found.moved == ["opacity"]
+    assert len(set(found.rows)) == 1
+    assert found.steps == (STEPS, STEPS)
+    before, after = found.fragments
     assert after < before
 
 
-RENDER = (
-    TORCHVISION
-    + """
-import contextlib, hashlib, json
-from pathlib import Path
-import torch
-torch.set_num_threads(1)
-from fragprune_plugins.injection.launch import RunOptions, run
-from fragprune_plugins.files import sidecar
-host, out = Path(sys.argv[1]), Path(sys.argv[2])
-def pictures():
-    run([str(host / "render.py"), "-m", str(out), "--skip_train"], RunOptions(device="cpu"))
-    found = sorted(out.glob("test/ours_*/*/*.png"))
-    return [hashlib.sha256(path.read_bytes()).hexdigest() for path in found]
-with contextlib.redirect_stdout(sys.stderr):
-    with_thresholds = pictures()
-    (beside,) = out.glob("point_cloud/*/*.safetensors")
-    beside.unlink()
-    without = pictures()
-print(json.dumps([len(with_thresholds), with_thresholds != without]))
-"""
+def need(*packages):
+    if missing := [name for name in packages if find_spec(name) is None]:
+        pytest.skip(f"the host imports {', '.join(missing)}")
+
+
+@pytest.mark.parametrize(
+    ("host", "training"),
+    [
+        case
+        for name, trainings in TRAININGS.items()
+        for training in trainings
+        for case in each_of(name, training)
+    ],
 )
-
-
-@every_renderer
-def test_the_hosts_own_render_script_applies_thresholds(host, dataset, tmp_path, python):
-    python(RUN, host, dataset, tmp_path / "out", "opacity", *flags(host))
-    count, differ = python(RENDER, host, tmp_path / "out")
-    assert count > 0
-    assert differ
-
-
-FINETUNE = RUN.replace("replace(options)", 'replace(options, stage="finetune")')
+def test_training_then_fine_tuning(host, training, dataset, tmp_path):
+    need(*training.needs)
+    words = f"{host / training.script} {FLAGS} {training.flags}"
+    words = words.format(data=dataset, out=tmp_path / "out").split()
+    expect_opacities_moved_alone(fresh(learned, words, "auto", training.checkpoint, seconds=800))
 
 
 @every_vanilla
-def test_exposures_of_a_late_host_come_through_stage_two_unchanged(host, dataset, tmp_path, python):
+def test_exposures_of_a_late_host_come_through_stage_two_unchanged(host, dataset, tmp_path):
     if "2023" in Vanilla3DGS().revision(HostRepo(host)):
         pytest.skip("this state has no exposures")
-    out = tmp_path / "out"
-    python(RUN, host, dataset, out, "opacity", *flags(host), "--train_test_exp")
-    final = json.loads((out / "exposure.json").read_text())
+    words = f"{host / 'train.py'} {FLAGS} --port 0 --train_test_exp"
+    words = words.format(data=dataset, out=tmp_path).split()
+    found = []
+    for stage in ("auto", "finetune"):
+        fresh(learned, words, stage, seconds=800)
+        found.append(json.loads((tmp_path / "exposure.json").read_text()))
     identity = [[float(i == j) for j in range(4)] for i in range(3)]
-    assert any(value != identity for value in final.values())
-    second = tmp_path / "second"
-    shutil.copytree(out, second)
-    python(FINETUNE, host, dataset, second, "opacity", *flags(host), "--train_test_exp")
-    assert json.loads((second / "exposure.json").read_text()) == final
+    assert any(value != identity for value in found[0].values())
+    assert found[0] == found[1]
+
+
+# -- hosts of moving scenes, and the scripts that time their frames --------------------------------
+
+
+def frames(script, host, *words):
+    """What a script of docs/how-to says of two models."""
+    line = [sys.executable, HOW_TO / script, host, *words, "--rounds", 1, "--device", "cpu"]
+    done = subprocess.run(list(map(str, line)), check=True, capture_output=True, text=True)
+    assert len(re.findall(r"ms, least .*x$", done.stdout, re.MULTILINE)) == 2
+    return done.stdout
+
+
+@pytest.mark.parametrize("host", each_of("4dgaussians"))
+def test_a_network_that_moves_gaussians_stands_still(host, recording, tmp_path):
+    """The host resizes pictures of this layout to 800x800: this takes minutes."""
+    need("torchvision", "matplotlib", "cv2")
+    words = f"{host / 'train.py'} {MOVING}".format(data=recording, out=tmp_path / "out").split()
+    found = fresh(learned, words, "auto", seconds=800)
+    expect_opacities_moved_alone(found)
+    folders = [model.parent for model in found.models]
+    assert [folder.name for folder in folders] == ["iteration_14", "iteration_21"]
+    drawn = frames("4dgaussians_frames.py", host, *folders)
+    counts = re.findall(r"(\d+) Gaussians, .* per pixel, .* dB, SSIM", drawn)
+    assert counts == [str(found.rows[0])] * 2
+    assert "2 views of 800x800 pixels" in drawn
+
+
+YAML = """
+gaussian_dim: 4
+time_duration: [0.0, 1.0]
+num_pts: 300
+batch_size: 2
+rot_4d: {rot}
+test_iterations: [-1]
+ModelParams:
+  source_path: "{data}"
+  model_path: "{out}"
+  sh_degree: 3
+  eval: True
+PipelineParams:
+  eval_shfs_4d: True
+  compute_cov3D_python: {python}
+  env_map_res: 0
+OptimizationParams:
+  iterations: 30
+  densify_from_iter: 5
+  densification_interval: 10
+  densify_until_iter: 25
+  densify_grad_threshold: 0.002
+  sh_increase_interval: 5
+  lambda_opa_mask: 0.05
+  lambda_rigid: {rigid}
+  lambda_motion: {rigid}
+"""
+
+
+@pytest.mark.parametrize("host", each_of("rt-4dgs"))
+@pytest.mark.parametrize(
+    ("rot", "python_slices"),
+    [(True, False), (False, False), (True, True)],
+    ids=["4D rotation", "without", "sliced in Python"],
+)
+def test_gaussians_of_space_and_time_stand_still(host, recording, tmp_path, rot, python_slices):
+    need("omegaconf", "imagesize", "kornia", "torchmetrics", "torchvision")
+    config = tmp_path / "a.yaml"
+    values = {"rot": rot, "python": python_slices, "data": recording, "out": tmp_path / "out"}
+    rigid = 0.5 if rot else 0.0  # the host's losses on velocities need 4D rotation
+    config.write_text(YAML.format(**values, rigid=rigid))
+    found = fresh(learned, [str(host / "train.py"), "--config", str(config)], "auto", seconds=800)
+    expect_opacities_moved_alone(found)
+    drawn = frames("rt_4dgs_frames.py", host, config, *found.models, "--enlarge", 2)
+    assert re.findall(r"(\d+) Gaussians, .* dB, SSIM", drawn) == [str(found.rows[0])] * 2
+    assert "frames of 96x96 pixels" in drawn
