@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from cli.commands import run as command_line
 from cli.commands import run_json
 from miniatures.runs import OPTIONS, check_stage_two, command, miniature
 from miniatures.surfels import SurfelHost
@@ -137,35 +136,13 @@ def test_a_point_cloud_alone_is_resumed(mini, photographs, trained, tmp_path):
 def test_portable_is_refused(mini, photographs, trained, tmp_path):
     _, words, _ = trained
     options = RunOptions(
-        device="cpu",
-        stage="finetune",
-        settings=Settings(iterations=8, goal=Portable()),
-        again=True,
+        device="cpu", stage="finetune", settings=Settings(iterations=8, goal=Portable()), again=True
     )
     with pytest.raises(InputError, match="surfels"):
         run(words, options)
 
 
 # -- its PLY elsewhere ---------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("finetune", "MODEL", "--self", "--out", "new.ply"),
-        ("render", "MODEL", "--orbit", "--out", "film.mp4"),
-        ("export", "MODEL", "--out", "new.spz"),
-        ("audit", "MODEL", "--out", "audit"),
-        ("view", "MODEL", "--out", "page"),
-    ],
-    ids=lambda words: words[0],
-)
-def test_commands_for_3d_gaussians_refuse_its_models(trained, tmp_path, words):
-    model = str(trained[0].model_before)
-    words = [str(tmp_path / w) if "." in w else w.replace("MODEL", model) for w in words]
-    result = command_line(*words)
-    assert result.exit_code == 1
-    assert "flat Gaussians with two scales" in result.stderr
 
 
 def test_reading_its_model_as_3d_gaussians_says_what_it_is(trained):

@@ -16,21 +16,22 @@ RATES = "        gaussians.update_learning_rate(iteration)\n"
 STEP = "                gaussians.optimizer.step()\n"
 
 
-@pytest.fixture(params=[True, False], ids=["rates first", "rates last"])
-def fork(request, tmp_path):
-    """The fork, with another name of a method, and rates that are set at another time."""
+@pytest.fixture
+def fork(tmp_path):
+    """The fork, with another name of a method."""
     root = tmp_path / "fork"
     ForkHost().write(root)
     train = root / "train_scene.py"
     for file in (root / "scene/gaussian_model.py", train):
         edit(file, "densify_and_prune", "renew")
-    if not request.param:
-        edit(train, RATES, "")
-        edit(train, STEP, STEP + RATES.replace("        ", " " * 16))
     return root
 
 
-def test_a_fork_is_trained_and_pruned(fork, photographs, tmp_path):
+@pytest.mark.parametrize("last", [False, True], ids=["rates first", "rates last"])
+def test_a_fork_is_trained_and_pruned(fork, photographs, tmp_path, last):
+    if last:
+        edit(fork / "train_scene.py", RATES, "")
+        edit(fork / "train_scene.py", STEP, STEP + RATES.replace("        ", " " * 16))
     words = runs.command(fork / "train_scene.py", photographs, tmp_path / "out", 12)
     summary = run(words, OPTIONS)
     check_stage_two(summary, "3dgs-fork")

@@ -124,13 +124,7 @@ def test_what_our_engines_would_leave_out_is_refused(scene, objects, given, what
         DIALECT.unpack(call_of(scene, objects, **given))
 
 
-@pytest.mark.parametrize(
-    "given",
-    [
-        {"confidence": torch.ones(40, 1)},
-        {"columns": 4},
-    ],
-)
+@pytest.mark.parametrize("given", [{"confidence": torch.ones(40, 1)}, {"columns": 4}])
 def test_what_changes_nothing_is_served(scene, objects, given):
     assert DIALECT.unpack(call_of(scene, objects, **given)).splats.features is not None
 

@@ -1,46 +1,27 @@
-"""Invariant 6: in stage 2 only what ``--train`` names and the thresholds move, to the bit."""
+"""Invariant 6 where hosts do more than the kit's: other optimizers, rates, steps of their own."""
 
 import pytest
 import torch
-from miniatures.vanilla_3dgs import running, tensors
+from miniatures.vanilla_3dgs import running
 
 from fragprune_plugins.injection.stepping import asking_for_no_gradient
-from fragprune_plugins.learning.goals import Control
 from fragprune_plugins.learning.schedule import Settings
 
-MOVES = {
-    "opacity": {"opacity"},
-    "appearance": {"opacity", "f_dc", "f_rest"},
-    "all": {"xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation"},
-}
 
-
-@pytest.mark.parametrize("train", MOVES)
-def test_only_what_is_named_moves(train):
-    with running(Settings(iterations=9, train=train), from_step=2) as host:
-        model = host.model(20)
-        model.active_sh_degree = 1
-        camera = host.camera()
+@pytest.mark.parametrize("train", ["appearance", "all"])
+def test_what_an_optimizer_beside_the_models_trains_moves_only_if_everything_does(train):
+    with running(Settings(iterations=9, train=train), from_step=1) as host:
+        model, camera = host.model(20), host.camera()
         exposure = torch.nn.Parameter(torch.ones(3, 4))
         model.exposure_optimizer = torch.optim.Adam([exposure], lr=0.1, weight_decay=0.1)
         model.training_setup(host.arguments)
-        for iteration in (1, 2):
-            host.step(model, camera, iteration)
-        for group in model.optimizer.param_groups:
-            group["weight_decay"] = 0.01
-        before, colour = tensors(model), exposure.detach().clone()
-        for iteration in (3, 4, 5, 6):
-            model.update_learning_rate(iteration)
-            image = host.render(camera, model)["render"] * exposure[:, :1, None]
-            (image - camera.original_image).abs().mean().backward()
-            model.optimizer.step()
-            model.optimizer.zero_grad(set_to_none=True)
-            model.exposure_optimizer.step()
-            model.exposure_optimizer.zero_grad(set_to_none=True)
-        moved = {name for name, value in tensors(model).items() if not value.equal(before[name])}
-        assert moved == MOVES[train]
-        assert torch.equal(exposure.detach(), colour) == (train != "all")
-        assert host.store(model).steps == 4
+        host.step(model, camera, 1)
+        model.update_learning_rate(2)
+        image = host.render(camera, model)["render"] * exposure[:, :1, None]
+        (image - camera.original_image).abs().mean().backward()
+        model.optimizer.step()
+        model.exposure_optimizer.step()
+    assert torch.equal(exposure, torch.ones(3, 4)) == (train != "all")
 
 
 def test_before_stage_two_the_host_has_its_way():
@@ -81,7 +62,8 @@ def test_on_a_cpu_adam_is_fused_in_stage_two_and_the_host_pickles_its_own():
         for iteration in (1, 2, 3, 4):
             host.step(model, camera, iteration)
             assert not any(group["fused"] for group in groups)
-    assert fused == [set(), set(), MOVES["appearance"], MOVES["appearance"]]
+    appearance = {"opacity", "f_dc", "f_rest"}
+    assert fused == [set(), set(), appearance, appearance]
 
 
 def rates_of(model):
@@ -98,17 +80,6 @@ def test_thresholds_step_once_a_counted_step_however_often_the_hosts_optimizer_d
             model.optimizer.step()
             model.optimizer.step()
         assert host.store(model).steps == 3
-
-
-def test_the_control_trains_the_same_without_thresholds():
-    with running(Settings(iterations=9, goal=Control(), train="opacity")) as host:
-        model, camera = host.model(20), host.camera()
-        before = tensors(model)
-        for iteration in (1, 2, 3):
-            host.step(model, camera, iteration)
-        assert host.store(model).neutral
-        moved = {name for name, value in tensors(model).items() if not value.equal(before[name])}
-        assert moved == {"opacity"}
 
 
 def test_a_host_that_fails_to_draw_keeps_its_parameters_as_they_were():

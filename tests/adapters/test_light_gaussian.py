@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from miniatures import light_gaussian, runs
+from miniatures import runs
 from miniatures.light_gaussian import LightGaussianHost
 from miniatures.runs import OPTIONS, check_stage_two, frozen_differences, miniature
 from miniatures.vanilla_3dgs import Notes, expect_ancestors, joint, label, running
@@ -80,45 +80,7 @@ def test_both_forms_of_the_call_against_brute_force(mini, truncated, size):
     scores += scores
 
 
-def test_pruning_counts_what_is_left_after_truncation(mini, monkeypatch):
-    with joint(**of(mini)) as host:
-        model, camera = host.model(COUNT), host.camera()
-        host.step(model, camera, 1)
-        with torch.no_grad():
-            host.store(model).logits.copy_(torch.where(torch.arange(COUNT) < 5, 4.0, -9.0))
-        pipe = SimpleNamespace(debug=False, compute_cov3D_python=False, convert_SHs_python=False)
-        count = import_module("gaussian_renderer").count_render
-        scene = SimpleNamespace(getTrainCameras=lambda: [camera, host.camera(side=0.3)])
-        monkeypatch.setattr(light_gaussian, "count_render", count, raising=False)
-        prune_list = light_gaussian.prune_list
-        with torch.no_grad():
-            counts, _ = prune_list(model, scene, pipe, torch.zeros(3))
-            with host.paused():
-                whole, _ = prune_list(model, scene, pipe, torch.zeros(3))
-        assert (counts[:5] < whole[:5]).all()
-        assert (counts[5:] >= whole[5:]).all()  # those behind show through
-
-
 # -- rows ----------------------------------------------------------------------------------------
-
-
-def test_a_point_cloud_brings_its_thresholds_into_training(mini, tmp_path):
-    path = tmp_path / "point_cloud.ply"
-    with joint(**of(mini)) as host:
-        model = host.model(COUNT)
-        host.step(model, host.camera(), 1)
-        label(host, model)
-        model.save_ply(str(path))
-    with joint(**of(mini)) as host:
-        model = host.model(5, setup=False)
-        model.load_ply(str(path))
-        model.training_setup(host.arguments)
-        model.max_radii2D = torch.zeros(COUNT)
-        expect_ancestors(host, model)
-        model.prune_gaussians(0.4, torch.rand(COUNT))
-        expect_ancestors(host, model)
-        host.step(model, host.camera(), 2)
-        assert host.store(model).steps == 3  # it goes on where it stood
 
 
 @pytest.mark.parametrize("bands", [0, 1])

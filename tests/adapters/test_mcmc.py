@@ -8,9 +8,7 @@ import torch
 from miniatures import runs
 from miniatures.mcmc import MCMCHost
 from miniatures.runs import OPTIONS, check_stage_two, miniature
-from miniatures.vanilla_3dgs import (
-    joint,
-)
+from miniatures.vanilla_3dgs import joint
 
 from fragprune_mcmc import MCMC
 from fragprune_plugins.errors import HostFailed, UsageError

@@ -37,9 +37,6 @@ def test_a_scripts_folder_lies_in_its_host(mini):
         locate(mini / "nowhere" / "deep", adapters)
 
 
-RENDERER, MODEL = "gaussian_renderer/__init__.py", "scene/gaussian_model.py"
-
-
 # -- scores --------------------------------------------------------------------------------------
 
 
@@ -111,15 +108,12 @@ def test_every_script_is_fine_tuned_and_only_opacities_move(trained):
     assert (len(before.xyz) != 150) or variant == "gs"
 
 
-@pytest.mark.parametrize("variant", ["ms", "ms_d"])
-def test_stage_two_stands_still_where_points_would_be_made_anew(
-    mini, photographs, tmp_path, variant
-):
+def test_stage_two_stands_still_where_points_would_be_made_anew(mini, photographs, tmp_path):
     """It passes depth's iteration and the simplifications; the host goes through the motions."""
-    later = ["--densify_until_iter", 10, "--depth_interval", 9, "--simp_iteration2", 12]
-    more = [*later, *(["--simp_iteration1", 10] if variant == "ms" else [])]
+    more = ["--densify_until_iter", 10, "--depth_interval", 9]
+    more += ["--simp_iteration1", 10, "--simp_iteration2", 12]
     options = replace(OPTIONS, settings=Settings(iterations=8, threshold_lr=0.3, train="opacity"))
-    summary = run(command(mini, variant, photographs, tmp_path, 7, *more), options)
+    summary = run(command(mini, "ms", photographs, tmp_path, 7, *more), options)
     before = read_ply(summary.model_before)
     assert frozen_differences(summary.model_before, summary.model_after) == []
     store, _ = sidecar.load(summary.model_after)
@@ -128,10 +122,7 @@ def test_stage_two_stands_still_where_points_would_be_made_anew(
     assert before.f_rest.shape[1] == 0  # a model saved before simplification has no f_rest
 
 
-@pytest.mark.parametrize("variant", ["ms", "ms_d"])
-def test_thresholds_learn_through_new_points_and_simplification(
-    mini, photographs, tmp_path, plug, variant
-):
+def test_thresholds_learn_through_new_points_and_simplification(mini, photographs, tmp_path, plug):
     class Rows:
         def __init__(self):
             self.changes = []
@@ -144,16 +135,15 @@ def test_thresholds_learn_through_new_points_and_simplification(
     rows = Rows()
     plug(rows)
     options = replace(OPTIONS, stage="joint", from_iter=2)
-    summary = run(command(mini, variant, photographs, tmp_path, 16), options)
+    summary = run(command(mini, "ms", photographs, tmp_path, 16), options)
     store, _ = sidecar.load(summary.model_after)
     assert len(store) == len(read_ply(summary.model_after).xyz)
     anew = [change for change in rows.changes if change[0] == "training_setup"]
     assert len(anew) == 2  # from depth at 6, from its own points at 10
     assert all(neutral for *_, neutral in anew)
-    if variant == "ms":  # at 13 rows go, and those that stay keep what they have
-        operation, before, after, neutral = rows.changes[-1]
-        assert (operation, neutral) == ("keep", False)
-        assert after < before
+    operation, before, after, neutral = rows.changes[-1]  # rows go, others keep what they have
+    assert (operation, neutral) == ("keep", False)
+    assert after < before
 
 
 def test_a_run_without_learning_keeps_the_thresholds_of_its_checkpoint(mini, photographs, tmp_path):
@@ -162,10 +152,7 @@ def test_a_run_without_learning_keeps_the_thresholds_of_its_checkpoint(mini, pho
     summary = run(command(mini, "ms", photographs, out, 16, *later), OPTIONS)
     before, whole = read_ply(summary.model_after), sidecar.load(summary.model_after)[0]
     more = ["--start_checkpoint", out / "chkpnt23.pth", "--simp_iteration2", 24]
-    run(
-        command(mini, "ms", photographs, tmp_path / "b", 25, *more),
-        replace(OPTIONS, stage="off"),
-    )
+    run(command(mini, "ms", photographs, tmp_path / "b", 25, *more), replace(OPTIONS, stage="off"))
     model = tmp_path / "b/point_cloud/iteration_25/point_cloud.ply"
     after, store = read_ply(model), sidecar.load(model)[0]
     assert len(store) == len(after.xyz) < len(before.xyz)

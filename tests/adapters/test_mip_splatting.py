@@ -13,9 +13,8 @@ from PIL import Image
 
 from fragprune_mip_splatting import MipSplatting
 from fragprune_plugins import rasterize
-from fragprune_plugins.errors import ModelFileError, NotComparedError
+from fragprune_plugins.errors import NotComparedError
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.workbench.commands.options import EngineOptions
@@ -27,12 +26,6 @@ COUNT = 16
 
 
 mini, of = miniature(MipHost, MipSplatting, driver=MipHost)
-
-
-# -- which host ----------------------------------------------------------------------------------
-
-
-RENDERER, MODEL = "gaussian_renderer/__init__.py", "scene/gaussian_model.py"
 
 
 # -- the call ------------------------------------------------------------------------------------
@@ -75,18 +68,6 @@ def test_the_third_gradient_is_the_sum_over_pixels_of_both_others(mini, opened):
     torch.testing.assert_close(whole[:, 2], total, rtol=1e-4, atol=1e-7)
 
 
-def test_densification_takes_the_share_the_host_means_to_take(mini):
-    with joint(**of(mini)) as host:
-        model = host.model(60)
-        for iteration in range(1, 6):
-            host.step(model, host.camera(side=iteration / 20), iteration)
-        moved = (model.xyz_gradient_accum / model.denom).nan_to_num()
-        threshold = float(moved.quantile(0.9))
-        label(host, model)
-        cloned, split, _ = model.densify_and_prune(threshold, 0.005, 3.0, None)
-        assert 6 <= cloned + split <= 12  # those above either threshold: a tenth by each
-
-
 # -- rows ----------------------------------------------------------------------------------------
 
 
@@ -105,28 +86,6 @@ def test_a_gradient_that_equals_the_quantile_counts_as_the_host_counts_it(mini):
 
 
 # -- files ---------------------------------------------------------------------------------------
-
-
-def test_a_fused_model_gets_its_thresholds_too(mini, tmp_path):
-    path = tmp_path / "fused.ply"
-    with joint(**of(mini)) as host:
-        model = host.model(COUNT)
-        host.step(model, host.camera(), 1)
-        model.save_fused_ply(str(path))
-        values = host.store(model).values.detach()
-    store, info = sidecar.load(path)
-    assert torch.equal(store.values.detach(), values)
-    assert info.rows == COUNT
-    fused = read_ply(path).splats()  # an ordinary splat
-    torch.testing.assert_close(fused.scales, model.get_scaling_with_3D_filter.detach())
-
-
-def test_a_hosts_model_says_who_may_read_it(mini, tmp_path):
-    with joint(**of(mini)) as host:
-        host.model(COUNT).save_ply(str(tmp_path / "m.ply"))
-    with pytest.raises(ModelFileError, match="Mip-Splatting"):
-        read_ply(tmp_path / "m.ply")
-    assert MipSplatting().read_model(tmp_path / "m.ply").filter_3d.shape == (COUNT, 1)
 
 
 # -- whole runs ----------------------------------------------------------------------------------

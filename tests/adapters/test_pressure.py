@@ -72,42 +72,6 @@ def test_portable_gradients_are_those_of_loss_plus_pressure_times_area():
         assert host.store(model).neutral
 
 
-def test_a_portable_host_covers_less_and_its_thresholds_stay_neutral():
-    covered = []
-    for pressure in (0.0, 0.02):
-        with running(Settings(iterations=30, goal=Portable(pressure))) as host:
-            model, camera = host.model(40), host.camera()
-            for iteration in range(1, 31):
-                host.step(model, camera, iteration)
-            covered.append(model.get_scaling.detach().log().mean().item())
-            assert host.store(model).neutral
-            assert host.finish().steps == 30
-    assert covered[1] < covered[0] - 0.01
-
-
-def test_evaluation_renders_feel_no_pressure_and_count_for_nothing():
-    with joint(Settings(iterations=9, goal=Pressure(0.1), train="opacity")) as host:
-        model, camera, other = host.model(), host.camera(), host.camera(side=0.4)
-        host.step(model, camera, 1)
-        before = host.finish()
-        with torch.no_grad():
-            host.render(other, model)
-        assert host.finish() == before
-
-
-def test_more_pressure_means_fewer_fragments():
-    drawn = []
-    for pressure in (0.0, 0.01):
-        with running(
-            Settings(iterations=30, goal=Pressure(pressure), threshold_lr=0.3, train="opacity")
-        ) as host:
-            model, camera = host.model(40), host.camera()
-            for iteration in range(1, 31):
-                host.step(model, camera, iteration)
-            drawn.append(host.finish().fragments_after)
-    assert drawn[1] < 0.8 * drawn[0]
-
-
 class Enlarging(GraphdecoDialect):
     """Every call draws its view three times, ever closer, and answers with their mean."""
 
@@ -157,46 +121,6 @@ def test_a_target_is_met_over_all_pictures_of_all_views(adapter):
     before, after = torch.stack(counts).sum(dim=0).tolist()
     assert before / after == pytest.approx(1.6, rel=0.015)  # a calibration ends within 0.01
     assert summary.target_reached
-
-
-def gradients(host, model, cameras, iteration):
-    """Of thresholds and opacities, after one step's views; the loss is the mean over them."""
-    model.update_learning_rate(iteration)
-    store = host.store(model)
-    with torch.no_grad():
-        store.logits.copy_(torch.linspace(-3, 0, len(store)))
-    leaves = [store.logits, model._opacity]
-    for leaf in leaves:
-        leaf.grad = None
-    for camera in cameras:
-        image = host.render(camera, model)["render"]
-        ((image - camera.original_image).abs().mean() / len(cameras)).backward()
-    return [leaf.grad.clone() for leaf in leaves]
-
-
-def test_a_step_of_several_views_feels_the_mean_of_their_pressures():
-    with joint(Settings(iterations=9, goal=Pressure(0.02), train="opacity")) as host:
-        model = host.model(40)
-        views = [host.camera(), host.camera(side=0.4), host.camera(side=-0.4)]
-        alone = []
-        for number, view in enumerate(views, 1):
-            gradients(host, model, [view], number)  # so that the next step expects one view
-            alone.append(gradients(host, model, [view], number))
-        gradients(host, model, views, 7)
-        together = gradients(host, model, views, 8)
-        for index, grad in enumerate(together):
-            expected = torch.stack([grads[index] for grads in alone]).mean(dim=0)
-            torch.testing.assert_close(grad, expected, rtol=1e-5, atol=1e-9)
-        host.driver.descend(model)
-        host.finish()
-        single, batch = host.curves[-3:-1], host.curves[-1]
-        assert batch["fragments_per_pixel"] == pytest.approx(
-            sum(host.curves[i]["fragments_per_pixel"] for i in (1, 3, 5)) / 3
-        )
-        assert batch["loss"] == pytest.approx(
-            sum(host.curves[i]["loss"] for i in (1, 3, 5)) / 3, rel=1e-5
-        )
-        assert len(single) == 2
 
 
 def test_the_default_pressure_follows_the_hosts_loss_per_fragment():

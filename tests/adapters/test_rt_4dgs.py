@@ -205,10 +205,7 @@ OptimizationParams:
   sh_increase_interval: 4
   lambda_opa_mask: 1e-2
 """
-OPTIONS = {
-    "device": "cpu",
-    "settings": Settings(iterations=5, threshold_lr=0.3, train="opacity"),
-}
+OPTIONS = {"device": "cpu", "settings": Settings(iterations=5, threshold_lr=0.3, train="opacity")}
 
 
 def command(mini, config, *more):

@@ -208,7 +208,9 @@ def test_hook_fragprune_population_changed():
         model.densify_and_clone(torch.ones(15, 1), 0.5, 1e9)
         model.training_setup(host.arguments)  # a new optimizer for the same rows
         model._xyz = torch.nn.Parameter(model._xyz.detach().clone())
-        model.training_setup(host.arguments)
+        host.store(model).open(host.adapter.opacities(model))
+        model.training_setup(host.arguments)  # other rows, as re-initialising makes them
+        assert host.store(model).neutral
     changes = recorder.of("changed")
     assert [(c.operation, c.before, c.after) for _, c in changes] == [
         ("keep", 20, 15),

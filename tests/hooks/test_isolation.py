@@ -15,12 +15,7 @@ from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins import hookspecs
-from fragprune_plugins.plugins.hooks import (
-    engine_for,
-    schedule_for,
-    select_adapter,
-    thresholds_for,
-)
+from fragprune_plugins.plugins.hooks import engine_for, schedule_for, select_adapter, thresholds_for
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import Plugins
 from fragprune_plugins.workbench.check.verdict import models_of
@@ -188,10 +183,7 @@ def alone(tmp_path_factory):
 
 @pytest.mark.parametrize(
     ("hook", "error"),
-    [
-        *((hook, RuntimeError("disk full")) for hook in OBSERVERS),
-        ("fragprune_step", SystemExit(7)),
-    ],
+    [*((hook, RuntimeError("disk full")) for hook in OBSERVERS), ("fragprune_step", SystemExit(7))],
     ids=str,
 )
 def test_an_observer_that_raises_is_switched_off_and_the_run_goes_on(
