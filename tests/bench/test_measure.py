@@ -110,9 +110,7 @@ def row(ms: float, fragments: float, truncated: bool, **others: Any) -> dict[str
 
 def test_translation_is_the_ratio_of_the_two_ratios() -> None:
     found = translation([row(30, 50, False), row(20, 25, True)], "cpu")
-    assert found == {
-        "s 8x6": {"fragments": 2.0, "time": 1.5, "share": pytest.approx(0.75)},
-    }
+    assert found == {"s 8x6": {"fragments": 2.0, "time": 1.5, "share": pytest.approx(0.75)}}
 
 
 def test_translation_pairs_rows_of_the_same_work_only() -> None:
@@ -126,9 +124,7 @@ def test_translation_pairs_rows_of_the_same_work_only() -> None:
         row(1, 25, True, scene="other"),
         row(1, 25, True, gaussians=6),
     ]
-    assert translation(rows, "cpu") == {
-        "s 16x6": {"fragments": 2.0, "time": 2.0, "share": 1.0},
-    }
+    assert translation(rows, "cpu") == {"s 16x6": {"fragments": 2.0, "time": 2.0, "share": 1.0}}
     assert list(translation([*rows, row(15, 25, True)], "cpu")) == ["s 8x6", "s 16x6"]
 
 

@@ -150,12 +150,7 @@ class Tab:
 
 @contextmanager
 def opened(
-    browser: Any,
-    address: str,
-    *,
-    width: int = 1280,
-    height: int = 720,
-    **context: Any,
+    browser: Any, address: str, *, width: int = 1280, height: int = 720, **context: Any
 ) -> Iterator[Tab]:
     """Open a page that gets nothing from anywhere but its own origin.
 

@@ -86,11 +86,7 @@ def test_what_was_learned_there_is_saved_here(scene, engine):
 
 def test_a_run_is_measured_there(scene, engine):
     data, path, _, _ = scene
-    photographs = {
-        **Photographs(data).as_dict(),
-        "models": [str(path)] * 2,
-        "drawing": {},
-    }
+    photographs = {**Photographs(data).as_dict(), "models": [str(path)] * 2, "drawing": {}}
     before, after = measure_models(photographs, EngineOptions(device="cuda"))
     assert (before["device"], after["engine"]) == ("meta", "elsewhere")
 

@@ -102,8 +102,7 @@ def test_a_process_that_raises_takes_all_down_with_its_own_words(scene, tmp_path
 
 
 @pytest.mark.parametrize(
-    ("number", "more"),
-    [(signal.SIGINT, ()), (signal.SIGTERM, ("--shard-gaussians",))],
+    ("number", "more"), [(signal.SIGINT, ()), (signal.SIGTERM, ("--shard-gaussians",))]
 )
 def test_a_signal_to_one_ends_all_after_the_same_step(scene, tmp_path, number, more):
     """Then one process goes on; shards go on as shards."""
@@ -154,28 +153,19 @@ def test_what_goes_before_and_around_learning_is_the_same_in_both(scene, tmp_pat
     assert one.read_bytes() == two.read_bytes()
 
 
-def test_shards_report_and_write_what_one_process_does(scene, tmp_path):
-    """Last bits differ, for gradients are summed in another order."""
-    one, two, log = tmp_path / "one.ply", tmp_path / "two.ply", tmp_path / "log.csv"
-    words_ = words(scene, one, "--views-per-step", 2, "--train", "opacity")
-    whole = run_json(*words_)
-    more = ("--train", "opacity", "--shard-gaussians", "--json", "--log", f"csv:{log}")
-    first, second = command(2, *words(scene, two, *more))
-    code, out, err = first.left
+def test_shards_write_and_report_as_one_process_does(scene, tmp_path):
+    """What they learn is test_shards'."""
+    out, log = tmp_path / "out.ply", tmp_path / "log.csv"
+    more = ("--train", "opacity", "--shard-gaussians", "--iters", 2)
+    first, second = command(2, *words(scene, out, *more, "--json", "--log", f"csv:{log}"))
+    code, printed, err = first.left
     assert (code, second.left) == (0, (0, "", "")), err
-    report = json.loads(out)
-    assert (whole["shards"], report["shards"]) == (1, 2)
-    for when in ("before", "after", "untruncated"):
-        for name in ("psnr", "ssim", "fragments_per_pixel", "area_per_pixel", "gaussians"):
-            assert report[when][name] == pytest.approx(whole[when][name], rel=1e-4), name
-    assert report["speedup"] == pytest.approx(whole["speedup"], rel=1e-4)
-    model = read_ply(two)
-    assert torch.equal(model.f_dc, read_ply(one).f_dc)
-    assert torch.allclose(model.opacity, read_ply(one).opacity, atol=1e-5)
-    assert torch.allclose(model.falloff, read_ply(one).falloff, rtol=1e-4)
+    report = json.loads(printed)
+    assert report["shards"] == 2
+    assert report["after"]["gaussians"] == len(read_ply(out)) == 60
     with open(log) as file:
-        assert len(list(csv.DictReader(file))) == 20
-    text = command(2, *words(scene, two, *more[:3], "--again", "--iters", 2))[0].left[1]
+        assert len(list(csv.DictReader(file))) == 2
+    text = command(2, *words(scene, out, *more, "--again"))[0].left[1]
     assert "2 processes held a part of the Gaussians each" in text
 
 

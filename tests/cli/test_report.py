@@ -85,10 +85,7 @@ def test_as_text_the_result_comes_first(folder):
 
 @pytest.mark.parametrize(
     ("name", "found", "remedy"),
-    [
-        ("pruned.ply", "a file", "fragprune view "),
-        ("nowhere", "no such folder", "Check the name"),
-    ],
+    [("pruned.ply", "a file", "fragprune view "), ("nowhere", "no such folder", "Check the name")],
 )
 def test_what_is_no_folder_is_refused_with_the_next_command(folder, name, found, remedy):
     out, _, _ = folder

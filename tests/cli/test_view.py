@@ -133,10 +133,7 @@ def test_serves_until_ctrl_c(cut_scene, monkeypatch):
 
 @pytest.mark.parametrize(
     ("options", "words"),
-    [
-        (("--data", "x", "--cameras", "y"), "--cameras"),
-        (("--port", "70000"), "--port"),
-    ],
+    [(("--data", "x", "--cameras", "y"), "--cameras"), (("--port", "70000"), "--port")],
 )
 def test_options_that_do_not_fit(cut_scene, options, words):
     result = run("view", cut_scene[1], *options)

@@ -7,13 +7,7 @@ import pytest
 from miniatures.forks import fork
 
 from fragprune_3dgs_fork import ForkAdapter
-from fragprune_plugins.adapting import (
-    EngineError,
-    HostCall,
-    NotComparedError,
-    Role,
-    UsageError,
-)
+from fragprune_plugins.adapting import EngineError, HostCall, NotComparedError, Role, UsageError
 from fragprune_plugins.hosts.choosing import attempt, choose
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.plugins.loading import load_plugins
@@ -436,11 +430,7 @@ REFUSED = {
         [("def render(viewpoint_camera, pc,", "def render(viewpoint_camera, xyz,")],
         "a camera and a model",
     ),
-    "a whole result": (
-        {},
-        [("image, radii = rasterizer(", "both = rasterizer(")],
-        "not unpacked",
-    ),
+    "a whole result": ({}, [("image, radii = rasterizer(", "both = rasterizer(")], "not unpacked"),
     "computed positions": ({}, [("return self._xyz\n", "return self.net()\n")], "computed"),
 }
 

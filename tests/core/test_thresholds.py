@@ -169,27 +169,6 @@ def test_neutral_without_version_counters():
         assert not store.neutral
 
 
-@given(st.integers(0, 2**8 - 1), st.integers(0, 2**8 - 1))
-def test_surviving_rows_train_bit_for_bit_as_they_would_have_alone(first, second):
-    """Rows do not interact, so a plain Adam on the survivors from the start is the oracle."""
-    generator = torch.Generator().manual_seed(first * 256 + second)
-    gradients = torch.randn(9, 8, generator=generator)
-    store, alive = ThresholdStore(8), torch.arange(8)
-    for i, gradient in enumerate(gradients):
-        if i in (3, 6):
-            bits = (first, second)[i == 6]
-            mask = torch.tensor([bool(bits >> int(row) & 1) for row in alive], dtype=torch.bool)
-            store.keep(mask)
-            alive = alive[mask]
-        stepped(store, gradient[alive].tolist(), 0.05)
-    plain = torch.full((len(alive),), -30.0, requires_grad=True)
-    adam = torch.optim.Adam([plain], lr=0.05, eps=1e-15)
-    for gradient in gradients:
-        plain.grad = gradient[alive].clone()
-        adam.step()
-    assert torch.equal(store.logits.detach(), plain.detach())
-
-
 def test_a_new_store_is_neutral_exactly_and_cannot_drift():
     store = ThresholdStore(7)
     assert store.neutral
@@ -343,7 +322,8 @@ def test_thresholds_that_are_none_are_refused(given):
 
 def test_a_limit_of_alpha_is_the_same_alpha_at_every_rim():
     opacities = torch.tensor([[0.05], [0.5], [1.0]])
-    store = ThresholdStore.from_alpha(0.04, opacities)
+    store = ThresholdStore.from_alpha(0.04, opacities, lr=0.25)
+    assert store.optimizer.param_groups[0]["lr"] == 0.25
     assert torch.allclose(store.values * opacities[:, 0], torch.tensor(0.04))
     faint = ThresholdStore.from_alpha(0.1, torch.tensor([0.0, 0.05, 0.1])).values
     assert ((faint > 0.999) & (faint < 1)).all()
@@ -357,9 +337,3 @@ def test_every_step_is_counted():
     for _ in range(3):
         store.step()
     assert store.steps == 3
-
-
-def test_the_learning_rate_is_the_one_that_was_asked_for():
-    opacities = torch.tensor([0.5, 0.9])
-    store = ThresholdStore.from_alpha(0.02, opacities, lr=0.25)
-    assert store.optimizer.param_groups[0]["lr"] == 0.25

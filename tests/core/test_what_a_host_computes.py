@@ -71,10 +71,7 @@ def test_a_vendored_rasterizer_that_draws_by_the_known_rule_fits(tmp_path):
         ),
         ({"widened": "cov[0][0] += 0.1f;"}, "a low-pass filter of 0.1"),
         ({"widened": ""}, "no low-pass filter"),
-        (
-            {"blend": f"{QUADRATIC} float alpha = c.w * exp(power);"},
-            "not capped at 0.99",
-        ),
+        ({"blend": f"{QUADRATIC} float alpha = c.w * exp(power);"}, "not capped at 0.99"),
     ],
 )
 def test_one_that_draws_by_another_is_refused_by_line(tmp_path, changed, says):

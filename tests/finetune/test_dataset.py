@@ -35,13 +35,6 @@ def test_colmap(tmp_path, images, binary, model):
     check(load_dataset(tiny.write_colmap(tmp_path, images, binary=binary, model=model)), images)
 
 
-def test_colmap_without_the_zero(tmp_path, images):
-    tiny.write_colmap(tmp_path, images)
-    for file in (tmp_path / "sparse" / "0").iterdir():
-        file.rename(tmp_path / "sparse" / file.name)
-    check(load_dataset(tmp_path), images)
-
-
 def test_blender(tmp_path, images):
     check(load_dataset(tiny.write_blender(tmp_path, images)), images)
 
@@ -107,15 +100,6 @@ def of_one_image(folder):
     path.write_text("\n".join(path.read_text().splitlines()[:3]) + "\n")
 
 
-def cut(name, end):
-    def act(folder):
-        path = folder / SPARSE / name
-        path.write_bytes(path.read_bytes()[:end])
-
-    return act
-
-
-OTHER = "3 PINHOLE 32 32 36 36 16 16\n"
 BLENDER = {
     "no test file": (lambda f: (f / TEST).unlink(), "transforms_test.json: no such file"),
     "no frames": (without_frames, "not a transforms file"),
@@ -126,9 +110,7 @@ COLMAP = {
     "image missing": (lambda f: (f / VIEW).unlink(), "view03.png: no such image"),
     "image broken": (lambda f: (f / VIEW).write_bytes(b"none"), "view03.png: not readable"),
     "image size": (lambda f: Image.new("RGB", (32, 24)).save(f / VIEW), "32x24 pixels.*32x32"),
-    "cut off": (cut("images.txt", 60), "images.txt: cut off"),
     "no cameras": (lambda f: (f / SPARSE / "cameras.txt").unlink(), "cameras.txt: no such file"),
-    "other cameras": (lambda f: (f / SPARSE / "cameras.txt").write_text(OTHER), "of camera 7"),
     "one view": (of_one_image, "no training view"),
 }
 

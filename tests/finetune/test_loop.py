@@ -28,11 +28,7 @@ def default(model, dataset):
 
 @pytest.mark.parametrize(
     ("train", "moving"),
-    [
-        ("opacity", {"opacity"}),
-        ("appearance", {"opacity", "f_dc", "f_rest"}),
-        ("all", set(ALL)),
-    ],
+    [("opacity", {"opacity"}), ("appearance", {"opacity", "f_dc", "f_rest"}), ("all", set(ALL))],
 )
 def test_what_is_not_named_stays_to_the_bit(model, dataset, train, moving):
     before = {name: getattr(model, name).clone() for name in ALL}
@@ -72,13 +68,9 @@ def test_loss_falls_and_fragments_fall(default, model, dataset):
     assert [point.step for point in default.curves] == list(range(1, 61))
 
 
-def test_more_pressure_draws_less(default, model, dataset):
-    hard = finetune(model, dataset, Settings(iterations=60, goal=Pressure(5e-3)))
-    assert hard.progress.speedup > default.progress.speedup
-
-
-def test_control_learns_opacities_alone(model, dataset):
-    result = finetune(model, dataset, Settings(iterations=20, goal=Control()))
+def test_a_control_learns_without_thresholds_also_of_a_model_with_some(model, dataset):
+    cut = tiny.cut(model, 0.3)
+    result = finetune(cut, dataset, Settings(iterations=20, goal=Control()))
     assert result.model.thresholds is None
     assert result.progress.speedup == pytest.approx(1, abs=0.05)  # opacities alone move
     assert not torch.equal(result.model.opacity, model.opacity)
@@ -135,8 +127,8 @@ def test_the_usual_stop_is_drawn_from_the_first_step_and_goes_with_the_model(mod
     assert result.model.stop == usual
 
 
-@pytest.mark.parametrize("target", [1.4, 2.0])
-def test_target_is_met_on_training_views(model, dataset, target):
+def test_target_is_met_on_training_views(model, dataset):
+    target = 2.0
     result = finetune(model, dataset, Settings(iterations=80, goal=Fewer(target)))
     engine = create_engine("auto")
     before = mean_fragments(model, dataset.train, engine)
@@ -211,11 +203,6 @@ def test_going_on_from_a_result_leaves_that_result_alone(default, dataset):
         assert torch.equal(each, before[name]), name
 
 
-def test_a_control_has_no_thresholds_even_of_a_model_with_some(default, dataset):
-    result = finetune(default, dataset, Settings(iterations=1, goal=Control()))
-    assert result.model.thresholds is None
-
-
 @pytest.mark.parametrize("rows", [0, 1, 61])
 def test_thresholds_of_another_model_are_refused_with_both_counts(model, rows):
     with pytest.raises(AlignmentError, match=f"{rows} thresholds; expected 60"):
@@ -238,36 +225,6 @@ def test_calibration_keeps_the_nearest_end_when_out_of_reach():
 def ms_of(outputs) -> float:
     """What a frame takes on a machine whose clock is exact."""
     return 0.02 + 1e-3 * outputs.evaluated_per_pixel + 2e-3 * float(outputs.fragments_per_pixel)
-
-
-@pytest.mark.parametrize("target", [1.2, 1.4])
-def test_a_target_time_is_met_where_frames_take_what_is_measured(
-    model, dataset, target, monkeypatch
-):
-
-    def timed(work, device):
-        inputs, thresholds = work.args
-        leaves = [inputs.splats.means, inputs.splats.opacities, thresholds]
-        assert not any(leaf is not None and leaf.requires_grad for leaf in leaves)  # no states kept
-        outputs = work()
-        return outputs, ms_of(outputs)
-
-    monkeypatch.setattr(faster, "timed", timed)
-    monkeypatch.setattr(faster, "_SECONDS", 0.0)
-    settings = Settings(iterations=60, goal=Faster(target))
-    result = finetune(model, dataset, settings, engine="cpu")
-    assert result.progress.target_reached
-    assert result.progress.faster == pytest.approx(target, rel=0.02)
-    engine, times = create_engine("cpu"), []
-    for each in (model, result.model):
-        drawn = [
-            engine.rasterize(
-                RasterInputs(shot.view, each.splats(), planes=(), **each.rules), each.falloff
-            )
-            for shot in dataset.train
-        ]
-        times.append(sum(map(ms_of, drawn)))
-    assert times[0] / times[1] == pytest.approx(target, rel=0.02)
 
 
 def test_a_target_time_that_no_threshold_reaches_is_refused_before_any_work(

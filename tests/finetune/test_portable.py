@@ -31,19 +31,6 @@ def area(model, dataset):
     return sum(covered_per_pixel(engine, RasterInputs(s.view, splats)) for s in shots) / len(shots)
 
 
-def test_more_pressure_covers_less(scene):
-    data, _, model = scene
-    dataset = fp.load_dataset(data)
-    settings = Settings(iterations=40, goal=Portable(0.0))
-    free, light = (
-        finetune(model, dataset, replace(settings, goal=Portable(pressure)))
-        for pressure in (0.0, 5e-2)
-    )
-    assert light.model.thresholds is None
-    assert area(light.model, dataset) < 0.9 * area(free.model, dataset)
-    assert len(light.model) == len(model)
-
-
 def test_without_pressure_it_is_the_control_to_the_bit(scene):
     data, _, model = scene
     dataset = fp.load_dataset(data)

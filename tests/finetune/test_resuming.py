@@ -26,17 +26,7 @@ class Cut(BaseException):
     """What nothing catches, as nothing catches a kill."""
 
 
-def run(
-    model,
-    dataset,
-    settings,
-    path=None,
-    *,
-    cut=None,
-    monkeypatch=None,
-    tell=None,
-    **options,
-):
+def run(model, dataset, settings, path=None, *, cut=None, monkeypatch=None, tell=None, **options):
     """Fine-tune, with a checkpoint every third step; ``cut`` ends it in the midst of that step."""
     kept = None if path is None else Checkpoints(path, None, 3, tell or (lambda _: None))
     options |= {"engine": "cpu", "checkpoints": kept}

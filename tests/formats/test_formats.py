@@ -33,14 +33,7 @@ BOUNDS = {
         "scaling": 1 / 32,
         "shape": 0.13,  # scales differ by 3 % each, so variances by 6 %
     },
-    ".glb": {
-        "xyz": 0,
-        "colour": 0,
-        "rest": 0,
-        "opacity": 1e-6,
-        "scaling": 1e-5,
-        "shape": 1e-4,
-    },
+    ".glb": {"xyz": 0, "colour": 0, "rest": 0, "opacity": 1e-6, "scaling": 1e-5, "shape": 1e-4},
     ".sog": {
         "xyz": 9 * 2 * math.log(9) / 65535 / 2 * 1.01,  # d x / d log(1 + x) is at most 9
         "colour": 1e-6,  # so few values have a codebook of their own, but for the rest

@@ -18,12 +18,7 @@ from fragprune_plugins.engines.cuda.comparison import Workload, compare
 
 CPU = torch.device("cpu")
 SMALL = Workload(
-    keys=9000,
-    gaussians=1500,
-    size=(90, 50),
-    wide_gaussians=150,
-    wide_size=(330, 290),
-    steps=3,
+    keys=9000, gaussians=1500, size=(90, 50), wide_gaussians=150, wide_size=(330, 290), steps=3
 )
 
 
@@ -128,21 +123,9 @@ def nothing_in_the_widest_rows_of_tiles(kernel: str, arguments: ctypes.Structure
             "large",
             "large frame, picture: 32 of 4500 are off, 32 of them",
         ),
-        (
-            a_block_of_rows_without_gradients,
-            "large",
-            "large frame, gradient of opacities: 2",
-        ),
-        (
-            another_picture_each_time,
-            "large",
-            "large frame: picture is another in another run",
-        ),
-        (
-            other_gradients_each_time,
-            "large",
-            "gradient of means is another in another run",
-        ),
+        (a_block_of_rows_without_gradients, "large", "large frame, gradient of opacities: 2"),
+        (another_picture_each_time, "large", "large frame: picture is another in another run"),
+        (other_gradients_each_time, "large", "gradient of means is another in another run"),
         (nothing_in_the_widest_rows_of_tiles, "wide", "wide frame, picture: 660 of"),
     ],
     ids=lambda value: getattr(value, "__name__", ""),

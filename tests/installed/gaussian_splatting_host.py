@@ -70,9 +70,7 @@ class GaussianSplattingHost(Host):
     def camera(self, width: int, height: int, *, side: float = 0.0) -> Any:
         photograph = super().camera(width, height).original_image
         own = import_module("gaussian_splatting.camera").build_camera(
-            *(height, width, 0.8, 0.6),
-            R=torch.eye(3),
-            T=torch.tensor([side, 0.0, 3.0]),
+            *(height, width, 0.8, 0.6), R=torch.eye(3), T=torch.tensor([side, 0.0, 3.0])
         )
         own = own._replace(ground_truth_image=photograph)
         return SimpleNamespace(own=own, original_image=photograph)

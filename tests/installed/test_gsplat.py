@@ -257,35 +257,6 @@ def test_check_takes_the_name_of_an_installed_host():
     assert unknown.exit_code == 1
 
 
-@pytest.mark.parametrize(
-    ("train", "asked"),
-    [
-        ("opacity", {"opacities"}),
-        ("appearance", {"opacities", "colors"}),
-        ("all", {"opacities", "colors", "means2d", "conics", "depths"}),
-    ],
-)
-def test_the_engine_works_out_gradients_of_what_trains_alone(session_on, train, asked):
-    """Though the loop activates its parameters before it draws, and they stay as it made them."""
-    with session_on(Gsplat(), settings=Settings(iterations=8, train=train)) as session:
-        from gsplat import DefaultStrategy
-
-        params, optimizers = new_params(40)
-        DefaultStrategy().check_sanity(params, optimizers)
-        engine, asking = session.engine(torch.device("cpu")), []
-        rasterize = engine.rasterize
-
-        def noting(inputs, thresholds):
-            fields = vars(inputs.splats).items()
-            asking.append({n for n, t in fields if torch.is_tensor(t) and t.requires_grad})
-            return rasterize(inputs, thresholds)
-
-        engine.rasterize = noting
-        draw(params)[0].mean().backward()
-        assert asking[0] == asked
-        assert all(parameter.requires_grad for parameter in params.values())
-
-
 @pytest.mark.parametrize("count", [1, 3])
 def test_a_target_is_met_over_every_camera_of_a_call(session_on, count):
     """The cameras see ever less, so that no one of them could speak for all."""

@@ -32,8 +32,7 @@ def pixels(model, thresholds):
     """For each pixel of each view: the fragments that are drawn, and the background."""
     splats = model.splats()
     splats = replace(
-        splats,
-        **{k: v.double() for k, v in vars(splats).items() if isinstance(v, torch.Tensor)},
+        splats, **{k: v.double() for k, v in vars(splats).items() if isinstance(v, torch.Tensor)}
     )
     for number, view in enumerate(VIEWS):
         view = replace(

@@ -116,12 +116,7 @@ ITSELF = {"target": "itself"}
 @pytest.mark.parametrize("infinite", [float("inf"), None])  # None: read from a record
 @pytest.mark.parametrize(("psnr", "warned"), [(45.2, False), (34.9, True)])
 def test_against_itself_there_is_no_figure_before_and_no_control(infinite, psnr, warned):
-    rows = {
-        "ssim": 1.0,
-        "area_per_pixel": 40.0,
-        "gaussians": 9,
-        "engine": "cpu",
-    }
+    rows = {"ssim": 1.0, "area_per_pixel": 40.0, "gaussians": 9, "engine": "cpu"}
     before = measured(39.1, 2.33, infinite) | rows | ITSELF | {"device": "cpu"}
     after = measured(25.0, 2.07, psnr) | rows | ITSELF | {"device": "cpu"}
     line = outcome("finetune", data() | {"before": before, "after": after}, None)

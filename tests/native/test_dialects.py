@@ -139,15 +139,6 @@ def test_larger_scenes_equal_the_oracle_closely(engine: CpuEngine, kind: str) ->
         expect_oracle(engine, case, thresholds)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (50, 37), (129, 18)])
-def test_scores_equal_the_oracles(engine: CpuEngine, size: tuple[int, int]) -> None:
-    inputs = replace(scenes.random_scene(0, 300, *size), scores=True)
-    for thresholds in (None, scenes.random_thresholds(0, 300)):
-        truth, ours, same = draw_pair(engine, inputs, thresholds)
-        check_images(truth, ours, same)
-        check_scores(truth, ours, same)
-
-
 def test_the_largest_weight_wins_wherever_it_lies(engine: CpuEngine) -> None:
     scene = footprints_of(scenes.stack([0.5, 0.25, 0.125]))
     scene.splats.means2d[:] = 8.0
@@ -273,10 +264,7 @@ def test_mips_small_numbers_count_where_determinants_are_small(
     scene = scenes.one_splat(sigma=(side, side), opacity=0.99)
     scene = replace(scene, compensation="mip", dilation=dilation)
     found = []
-    for draws, case in (
-        (engine, scene),
-        (ReferenceEngine(), scenes.cast(scene, torch.float64)),
-    ):
+    for draws, case in ((engine, scene), (ReferenceEngine(), scenes.cast(scene, torch.float64))):
         made, leaves = scenes.leaves(case)
         drawn = draws.rasterize(made.with_counts(), None)
         assert (drawn.fragments.sum() > 0).item() is (side > 0.0316)

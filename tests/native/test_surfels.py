@@ -8,11 +8,7 @@ import scenes
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from native.test_against_oracle import (
-    GRADIENT_TOLERANCE,
-    check_images,
-    draw_pair,
-)
+from native.test_against_oracle import GRADIENT_TOLERANCE, check_images, draw_pair
 from native.test_inputs import draw
 
 from fragprune_plugins.engines.cpu import binding

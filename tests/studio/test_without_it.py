@@ -144,10 +144,7 @@ def exporters(params, kept):
     }
 
 
-@given(
-    keys=st.lists(st.integers(0, 3), min_size=1, max_size=12),
-    chosen=st.sets(st.integers(0, 3)),
-)
+@given(keys=st.lists(st.integers(0, 3), min_size=1, max_size=12), chosen=st.sets(st.integers(0, 3)))
 def test_any_selection_by_values_is_followed_even_among_equal_rows(keys, chosen):
     """The exporter's filters look at values, so equal rows stay or go together."""
     params = {name: each[keys] for name, each in model(4).items()}

@@ -17,10 +17,7 @@ from fragprune_plugins.engines.cpu import binding
 ROOT = Path(__file__).parents[3]
 TESTS = ROOT / "tests" / "native"
 PLAIN = ("-O1", "-g1", "-fno-omit-frame-pointer")
-MEMORY = (
-    "-fsanitize=address,undefined,float-cast-overflow",
-    "-fno-sanitize-recover=all",
-)
+MEMORY = ("-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all")
 """Reads and writes out of bounds, leaks, and arithmetic that C++ leaves undefined."""
 
 THREADS = ("-fsanitize=thread",)
