@@ -292,6 +292,8 @@ def _not_resumed(repo: HostRepo, script: str, tree: ast.Module) -> str:
     trained = re.findall(r"self\.(\w+)\.parameters\(", ast.unparse(repo.tree(MODEL) or ast.Pass()))
     if networks := sorted({*whole} & {*trained}):
         return f"its checkpoints hold whole networks, {', '.join(networks)}"
+    if networks := sorted({*trained} - _mentioned(capture)):
+        return f"its checkpoints lack networks, {', '.join(networks)}"
     return ""
 
 
@@ -472,6 +474,8 @@ def _read_changes(fork: Fork) -> None:
                 continue
             at = fork.repo.at(_module(script), node.lineno)
             fork.warn("optimizer", at, f"stage 2 does not freeze what {name} of {script} trains")
+            if "load_state_dict" not in _mentioned(trained):
+                fork.one_run = fork.one_run or f"{script} does not resume what {name} trains"
 
 
 def read_getters(fork: Fork) -> list[Finding]:
@@ -532,6 +536,8 @@ def _read_draws(fork: Fork) -> None:
         fork.draws += (Draw(name, camera, model, calls),)
         for call in calls:
             _check_call(fork, at, name, call)
+        if cut := plain.read_cut(fork.repo, RENDERER, name):
+            fork.refuse("rasterizer-call", at, f"a picture of more channels, {cut}", "a picture")
         if selected := plain.read_selection(fork.repo, RENDERER, name):
             fork.refuse("rasterizer-call", at, f"draws a selection, {selected}", "all rows")
         fork.colours |= {

@@ -8,12 +8,22 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 from fragprune_graphdeco.call import RASTERIZER
 from fragprune_graphdeco.kernels import SPLAT, read_kernels
-from fragprune_plugins.adapting import Function, HostRepo, Plain, change_of, nodes, off_by_default
+from fragprune_graphdeco.reading import defaults
+from fragprune_plugins.adapting import (
+    Function,
+    HostRepo,
+    Plain,
+    change_of,
+    is_off,
+    nodes,
+    off_by_default,
+    parameter_defaults,
+)
 
 _DEEPEST = 3
 """Folders below a checkout in which codebases are looked for."""
@@ -29,6 +39,9 @@ _OF_CALL = re.compile(
     r"opacity|opacities|features|shs|rotations?|\w*sh\w*"
 )
 """Parameters of a drawing function that move or select Gaussians, or are their values."""
+_SHAPES = {"repeat", "expand", "view", "reshape", "squeeze", "contiguous"}
+"""Methods that change how often or in what shape a value stands, not the value."""
+_SAVES = re.compile(r"\.save_ply\(|scene\.save\(")
 _ACTIVATIONS = {
     "scaling_activation": ("torch.exp",),
     "opacity_activation": ("torch.sigmoid",),
@@ -54,7 +67,7 @@ def read_plain(repo: HostRepo) -> Plain:
     """Read a checkout's model, its save function, its drawing function and its kernel."""
     module, name = next(_models(repo), ("", ""))
     if not module:
-        return Plain(("no model of this family that saves a PLY was found",))
+        return Plain((_without(repo),))
     flat = list(_flat(repo, module, name))
     moving = dict(_of_drawing(repo))
     drawn = list(moving)
@@ -66,11 +79,24 @@ def read_plain(repo: HostRepo) -> Plain:
         *drawn,
         *_of_columns(repo, module, name),
         *_of_saving(repo, module, name),
+        *_of_positions(repo, module, name),
         *_of_others(repo, module),
+        *_of_scripts(repo),
     ]
     moved = frozenset(each for each, moves in moving.items() if moves)
     elsewhere = "" if repo.path("scene.gaussian_model") else f"{name} is in {module}"
     return Plain(tuple(dict.fromkeys(reasons)), name, moved, elsewhere=elsewhere)
+
+
+def _without(repo: HostRepo) -> str:
+    """Why no model was found that saves a PLY."""
+    if repo.function("scene.gaussian_model", "GaussianModel.__init__"):
+        at = repo.place("scene.gaussian_model", "GaussianModel")
+        return f"its GaussianModel has no save_ply ({at})"
+    paths = re.findall(r"^\s*path = (\S+)", repo.read(repo.root / ".gitmodules"), re.MULTILINE)
+    absent = [each for each in paths if not any((repo.root / each).glob("*"))]
+    beside = f"; its submodules are not in the checkout: {', '.join(absent)}" if absent else ""
+    return f"no model of this family that saves a PLY was found{beside}"
 
 
 def _models(repo: HostRepo) -> Iterator[tuple[str, str]]:
@@ -165,8 +191,56 @@ def _of_saving(repo: HostRepo, module: str, name: str) -> Iterator[str]:
                 yield f"its {attribute} is {value[:50]} ({repo.at(module, node.lineno)})"
     for getter, stored in (("get_opacity", "_opacity"), ("get_scaling", "_scaling")):
         body = repo.function(module, f"{name}.{getter}")
-        if body is not None and f"self.{stored}" not in ast.unparse(body):
+        if body is not None and not _activates(body, stored):
             yield f"{getter} is computed ({repo.place(module, f'{name}.{getter}')})"
+
+
+def _activates(getter: Function, stored: str) -> bool:
+    """Whether a getter returns a function of an attribute, or the attribute, in one branch."""
+    known: dict[str, bool] = {}
+
+    def reads(value: ast.expr | None) -> bool:
+        while isinstance(value, ast.Call) and getattr(value.func, "attr", "") in _SHAPES:
+            value = value.func.value  # type: ignore[attr-defined]
+        if isinstance(value, ast.Call) and value.args:
+            return reads(value.args[0])
+        if isinstance(value, ast.Name):
+            return known.get(value.id, False)
+        return value is not None and ast.unparse(value) == f"self.{stored}"
+
+    for statement in getter.body:
+        for node in nodes(statement):
+            if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+                name = node.targets[0].id
+                known[name] = reads(node.value) or (
+                    node is not statement and known.get(name, False)
+                )
+    return any(reads(node.value) for node in nodes(getter) if isinstance(node, ast.Return))
+
+
+def _of_positions(repo: HostRepo, module: str, name: str) -> Iterator[str]:
+    """Positions that no optimizer moves: something else makes them for every picture."""
+    setup = repo.function(module, f"{name}.training_setup")
+    trained = " ".join(
+        ast.unparse(value)
+        for node in nodes(setup)
+        if isinstance(node, ast.Dict)
+        for key, value in zip(node.keys, node.values, strict=True)
+        if getattr(key, "value", "") == "params"
+    )
+    if "self._opacity" in trained and not re.search(r"self\._xyz\b", trained):
+        at = repo.place(module, f"{name}.training_setup")
+        yield f"its optimizer does not train positions, which are made otherwise ({at})"
+
+
+def _of_scripts(repo: HostRepo) -> Iterator[str]:
+    """A renderer that is not there, and scripts of which none saves a PLY."""
+    if repo.path("gaussian_renderer") is None:
+        yield "what draws its PLY is not in the checkout: no gaussian_renderer"
+    scripts = sorted(repo.root.glob("*.py"))
+    others = (each for each in sorted(repo.root.glob("*/*.py")) if each.parent.name != "scene")
+    if scripts and not any(_SAVES.search(repo.read(each)) for each in (*scripts, *others)):
+        yield "none of its scripts saves a PLY"
 
 
 def _of_kernel(repo: HostRepo) -> Iterator[str]:
@@ -216,6 +290,13 @@ def read_selection(repo: HostRepo, module: str, function: str) -> str:
     return _Drawing(repo, module, body).selection() if body is not None else ""
 
 
+def read_cut(repo: HostRepo, module: str, function: str) -> str:
+    """The code that takes a function's picture out of further channels, as ``image[:3]``; or ""."""
+    body = repo.function(module, function)
+    cuts = _Drawing(repo, module, body).cuts() if body is not None else iter(())
+    return next(map(ast.unparse, cuts), "")
+
+
 class _Drawing:
     """A drawing function: where the inputs of its rasterizer come from."""
 
@@ -224,6 +305,11 @@ class _Drawing:
         arguments = function.args
         every = [*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs]
         self.parameters, self.off = {each.arg for each in every}, off_by_default(function)
+        self.switches = {
+            name
+            for name, value in parameter_defaults(function)
+            if isinstance(value, ast.Constant) and isinstance(value.value, bool)
+        }
         self.values: dict[str, list[ast.expr]] = {}
         self._collect(function.body)
         models = [
@@ -240,7 +326,9 @@ class _Drawing:
         for node in body:
             if isinstance(node, ast.If):
                 test = ast.unparse(node.test)
-                on = any(re.fullmatch(rf"{each}( is not None)?", test) for each in self.off)
+                on = self._is_colour_option(node) or any(
+                    re.fullmatch(rf"{each}( is not None)?", test) for each in self.off
+                )
                 none = any(re.fullmatch(rf"{each} is None|not {each}", test) for each in self.off)
                 self._collect([] if on else node.body)
                 self._collect([] if none else node.orelse)
@@ -253,6 +341,15 @@ class _Drawing:
             else:
                 for field in ("body", "orelse", "finalbody"):
                     self._collect(getattr(node, field, []))
+
+    def _is_colour_option(self, node: ast.If) -> bool:
+        """Whether a branch makes colours if an option asks for it that is off by default."""
+        option = node.test.attr if isinstance(node.test, ast.Attribute) else ""
+        if option in ("", "convert_SHs_python"):
+            return False
+        values = list(defaults(self.repo, "arguments", option))
+        colours = any(ast.unparse(each).startswith("colors_precomp = ") for each in node.body)
+        return colours and bool(values) and all(map(is_off, values))
 
     def _assign(self, target: ast.expr, value: ast.expr) -> None:
         if isinstance(target, ast.Tuple):
@@ -310,7 +407,10 @@ class _Drawing:
         the function make them from the model's own.
         """
         call = _call(self.function)
-        yield from ((each, False) for each in self._cut())
+        cuts = list(self.cuts())
+        if cuts and not any(re.search(r"\[0?:3[,\]]", ast.unparse(each)) for each in cuts):
+            cut = self.repo.at(self.module, cuts[0].lineno)
+            yield f"its picture is cut out of a tensor with further channels ({cut})", False
         given = {each.arg: each.value for each in call.keywords if each.arg} if call else {}
         at = self.repo.at(self.module, self.function.lineno)
         for argument in ("means3D", "opacities", "scales", "rotations"):
@@ -321,8 +421,7 @@ class _Drawing:
                 what = f"makes {argument} from {shown}, not from its PLY alone"
                 own = {"means3D": "get_xyz", "scales": "get_scaling", "rotations": "get_rotation"}
                 kept = f"{self.model}.{own.get(argument)}" in roots
-                beside = not any(re.match(rf"{self.model}($|\.get_)", each) for each in others)
-                yield f"{self.function.name} {what} ({at})", kept and beside
+                yield f"{self.function.name} {what} ({at})", kept and self._beside(others)
         if "shs" in given and "dc" not in given:
             roots = [*self._roots(given["shs"])]
             if not roots and "colors_precomp" in given:
@@ -332,9 +431,36 @@ class _Drawing:
             if others:
                 shown = ", ".join(others[:4])
                 yield f"{self.function.name} makes colours from {shown} ({at})", False
+            yield from self._of_colours(given)
 
-    def _cut(self) -> Iterator[str]:
-        """A picture that is some channels of what the rasterizer returns."""
+    def _of_colours(self, given: Mapping[str, ast.expr]) -> Iterator[tuple[str, bool]]:
+        """Colours that are no spherical harmonics of the model's features."""
+        value = given.get("colors_precomp", ast.Constant(None))
+        roots = dict.fromkeys(root for each in self._channels(value) for root in self._roots(each))
+        others = [each for each in roots if not self._plain(each)]
+        if isinstance(value, ast.Call):
+            others = [ast.unparse(value)]
+        if others:
+            at = self.repo.at(self.module, value.lineno)
+            own = any(each.startswith(f"{self.model}.get_features") for each in roots)
+            yield (
+                f"{self.function.name} makes colours from {', '.join(others[:4])} ({at})",
+                own and self._beside(others),
+            )
+
+    def _channels(self, value: ast.expr) -> Iterator[ast.expr]:
+        """What the first channels are, where the picture is cut out of more."""
+        for each in self.values.get(getattr(value, "id", ""), [value]):
+            parts = each.args[:1] if isinstance(each, ast.Call) and any(self.cuts()) else []
+            listed = parts and isinstance(parts[0], ast.Tuple | ast.List)
+            yield parts[0].elts[0] if listed else each  # type: ignore[attr-defined]
+
+    def _beside(self, roots: list[str]) -> bool:
+        """Whether these are neither the model as a whole nor other values of its rows."""
+        return not any(re.match(rf"{self.model}($|\.get_)", each) for each in roots)
+
+    def cuts(self) -> Iterator[ast.expr]:
+        """What takes channels out of the picture that the rasterizer returns."""
         call = _call(self.function)
         whole = {
             getattr(target.elts[0] if isinstance(target, ast.Tuple) else target, "id", "")
@@ -347,13 +473,18 @@ class _Drawing:
                 inner = node.value
                 while isinstance(inner, ast.Subscript):
                     inner = inner.value
-                if getattr(inner, "id", "") in whole:
-                    at = self.repo.at(self.module, node.lineno)
-                    yield f"its picture is cut out of a tensor with further channels ({at})"
-                    return
+            elif isinstance(node, ast.Subscript):
+                index, inner = node.slice, node.value
+                first = index.elts[0] if isinstance(index, ast.Tuple) and index.elts else index
+                if not isinstance(first, ast.Slice) or not (first.lower or first.upper):
+                    continue
+            else:
+                continue
+            if getattr(inner, "id", "") in whole:
+                yield node
 
     def _plain(self, root: str) -> bool:
         _, dot, attribute = root.partition(".")
         if dot:
             return bool(_OF_MODEL.fullmatch(attribute))
-        return root != self.model and bool(_OF_CALL.fullmatch(root))
+        return root in self.switches or (root != self.model and bool(_OF_CALL.fullmatch(root)))

@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import fragprune_graphdeco as graphdeco
+from fragprune_3dgs_fork import ForkAdapter
+from fragprune_3dgs_fork.fork import STATISTICS, read_fork
 from fragprune_graphdeco import GraphdecoAdapter, RasterizerCall
 from fragprune_plugins.adapting import (
     Door,
@@ -19,6 +21,7 @@ from fragprune_plugins.adapting import (
     HostInfo,
     HostRepo,
     ModelFileError,
+    Role,
 )
 
 _EXPOSURES = Door(
@@ -50,8 +53,27 @@ class Vanilla3DGS(GraphdecoAdapter):
     )
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
-        """Check the source; a finding names the revision."""
-        return super().fingerprint(repo) or [self._state(repo)]
+        """Check the source, as of a fork too; a finding names the revision."""
+        further = super().fingerprint(repo) or self._further(repo)
+        stopped = any(each.level == "error" for each in further)
+        return further if stopped else [*further, self._state(repo)]
+
+    def _further(self, repo: HostRepo) -> list[Finding]:
+        """What a fork of this interface does otherwise: ``3dgs-fork`` serves it, or nobody does."""
+        fork = read_fork(repo)
+        if not fork.scripts:
+            return []
+        held = (seam for seam in self.seams if seam.role is Role.STILL)
+        known = {seam.attribute.rpartition(".")[2] for seam in held} | STATISTICS
+        what = [f"{name}: {fork.unserved[name]}" for name in self.scripts if name in fork.unserved]
+        what += [f"{name}, which changes the model" for name in fork.still if name not in known]
+        what += [fork.one_run] if fork.one_run else []
+        steps = [
+            Finding.error("other-host", str(repo.root), each, "the steps of 3DGS alone")
+            for each in what
+        ]
+        found = ForkAdapter().fingerprint(repo)  # groups were checked: here they need no names
+        return [*(each for each in found if each.code != "param-groups"), *steps]
 
     def _state(self, repo: HostRepo) -> Finding:
         """A finding that names the revision; an error if it has no checkpoints."""

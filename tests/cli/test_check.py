@@ -58,6 +58,37 @@ def test_the_host_that_fits_with_every_seam_in_its_place(host):
     assert f"fragprune run -- python {host / 'train.py'}" in text.stdout
 
 
+OTHERWISE = {
+    "adds rows": (
+        "densify_and_prune(threshold, 0.005, scene.cameras_extent, largest)",
+        "densify_and_clone(grads, threshold, 1.0)",
+        "densify_and_clone, which changes the model",
+    ),
+    "resumes a PLY": (
+        "gaussians.restore(model_params, opt)",
+        "gaussians.load_ply(checkpoint)",
+        "train.py has no restore",
+    ),
+    "changes a parameter": (
+        "gaussians.optimizer.step()",
+        "gaussians._xyz = merged; gaussians.optimizer.step()",
+        "changes _xyz outside the model's methods",
+    ),
+    "steps twice": ("loss.backward()", "loss.backward(); more.backward()", "2 places that go back"),
+}
+
+
+@pytest.mark.parametrize("what", OTHERWISE)
+def test_a_script_with_other_steps_is_not_vanillas(host, what):
+    script = host / "train.py"
+    old, new, found = OTHERWISE[what]
+    assert old in script.read_text()
+    script.write_text(script.read_text().replace(old, new))
+    report = refused(host)
+    assert report["verdict"] == "finetune"
+    assert found in str(report["differs"])
+
+
 def test_nothing_is_imported(host, python):
     for file in host.rglob("*.py"):
         file.write_text(file.read_text() + "\nraise SystemExit('imported')\n")

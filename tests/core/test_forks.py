@@ -284,6 +284,11 @@ NOT_RESUMED = {
     "a dict": ("((gaussians.capture(), iteration)", '({"model": gaussians.capture(), "at": 1}'),
     "a removed folder": ("scene = Scene(", "shutil.rmtree(opt.model_path); scene = Scene("),
     "a lost state": ("self.optimizer.state_dict()", "None"),
+    "a network beside": (
+        "gaussians.training_setup(opt)",
+        "gaussians.training_setup(opt)\n    optim = torch.optim.Adam(net.parameters())",
+    ),
+    "a lost network": ('"params": [self.poses]', '"params": self.net.parameters()'),
     "a whole network": ('"params": [self.poses]', '"params": self.poses.parameters()'),
     "several models": (
         "gaussians = GaussianModel(3)",
@@ -324,7 +329,8 @@ MOVED = [
 
 
 def test_gaussians_that_a_network_beside_them_moves_keep_their_rows(tmp_path):
-    repo = fork(tmp_path, *MOVED, arguments=", means2D_densify=pc.points")
+    saves = ("--start_checkpoint", "--save_iterations")
+    repo = fork(tmp_path, *MOVED, saves, arguments=", means2D_densify=pc.points")
     network = "class DeformModel:\n    def step(self, xyz, t): ...\n"
     (tmp_path / "scene/deform_model.py").write_text(network)
     assert errors(repo) == []
@@ -391,6 +397,11 @@ REFUSED = {
         {},
         [("means3D=means3D", "means3D=xyz"), ("    shs =", "    xyz = means3D[rows]\n    shs =")],
         "draws a selection, means3D[rows]",
+    ),
+    "a picture of more channels": (
+        {},
+        [('"render": image', '"render": image[:3]')],
+        "a picture of more channels, image[:3]",
     ),
     "another model": ({}, [("GaussianModel(3)", "DeformModel(3)")], "makes DeformModel"),
     "neither checkpoints nor models on the way": (

@@ -125,6 +125,14 @@ def test_the_nearest_host_is_of_this_family(fork):
             "self.net(self._xyz)",
             "get_scaling is computed",
         ),
+        (
+            "self.scaling_activation(self._scaling)",
+            "self.scaling_activation(self._scaling) + self.least",
+            "get_scaling is computed",
+        ),
+        ("{'params': [], 'name': 'f_dc'}", "{'params': [self._opacity]}", "not train positions"),
+        ("shs=shs, scales", "colors_precomp=torch.exp(rgb), shs=shs, scales", "torch.exp(rgb)"),
+        ("shs=shs, scales", "colors_precomp=pc.net(view), shs=shs, scales", "colours from pc.net"),
     ],
 )
 def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):
@@ -141,10 +149,38 @@ def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):
         ('"opacity"]', '"opacity", "obj_dc_0"]'),
         ("= self._opacity.detach()", "= self.inverse_activation(self.get_opacity)"),
         ("opacity = pc.get_opacity\n", "opacity = pc.opacity_activation(pc._opacity)\n"),
+        ("activation(self._scaling)", "activation(self._scaling.repeat(1, 3))"),
+        ("shs = pc.get_features", "shs = pc.get_features(training)"),
+        ("rotations=rotations\n    )\n", "rotations=rotations\n    )\n    image = image[:3]\n"),
     ],
 )
 def test_what_leaves_the_picture_alone_is_plain(fork, old, new):
     assert read_plain(fork((old, new)))
+
+
+def test_what_is_never_saved_or_drawn_is_not_plain(fork, tmp_path):
+    repo = fork()
+    script = tmp_path / "train.py"
+    script.write_text(script.read_text().replace("scene.save(", "scene.show("))
+    assert "none of its scripts saves a PLY" in read_plain(repo).reasons
+    (tmp_path / "gaussian_renderer/__init__.py").unlink()
+    assert "no gaussian_renderer" in read_plain(HostRepo(tmp_path)).reasons[0]
+
+
+def test_of_several_folders_one_with_a_plain_ply_decides(fork, tmp_path):
+    fork((".repeat(1, 3)", ".repeat(1, 2)"), root=tmp_path / "a_flat")
+    assert judged(HostRepo(tmp_path)).reason.startswith("a_flat/: its Gaussians are flat")
+    fork(root=tmp_path / "b_plain")
+    assert judged(HostRepo(tmp_path)).kind == "finetune"
+
+
+def test_a_model_that_is_not_in_the_checkout_is_looked_for_in_its_submodules(tmp_path):
+    (tmp_path / ".gitmodules").write_text('[submodule "a"]\n\tpath = submodules/a\n')
+    assert judged(HostRepo(tmp_path)).reason.endswith("not in the checkout: submodules/a")
+    (tmp_path / "scene").mkdir()
+    model = "class GaussianModel:\n    def __init__(self, sh_degree): ...\n"
+    (tmp_path / "scene/gaussian_model.py").write_text(model)
+    assert "GaussianModel has no save_ply" in judged(HostRepo(tmp_path)).reason
 
 
 def test_a_model_in_another_module_is_named(fork, tmp_path):

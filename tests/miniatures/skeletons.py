@@ -13,6 +13,10 @@ SETTINGS = [
 GETTERS = {"get_xyz": "self._xyz", "get_opacity": "self.opacity_activation(self._opacity)"}
 
 FLAGS = """
+def report(scene, iteration):
+    scene.save(iteration)
+
+
 def read_flags(parser):
     for name in "--model_path", "--checkpoint_iterations", "--start_checkpoint":
         parser.add_argument(name)

@@ -79,7 +79,8 @@ def judge(
     differs = differences(repo, nearest, own.elsewhere) if nearest else ()
     plain = own
     if not own.model and not inside:
-        plain = next((each for each in others if each.model), own)
+        found = [each for each in others if each.model]
+        plain = next(filter(None, found), next(iter(found), own))
     if plain:
         sentence = (
             "No adapter fits, but its PLY is plain 3DGS, and this prunes it: "
@@ -93,8 +94,6 @@ def judge(
         )
         return Verdict("inside", sentence, own.reasons[0], name, differs, inside)
     reason = f"{plain.folder}/: {plain.reasons[0]}" if plain.folder else plain.reasons[0]
-    if nearest and not plain.model:  # what the nearest adapter misses tells more
-        reason += f"; {nearest.verdict()}"
     return Verdict("never", f"Not possible: {reason}.", reason, name, differs)
 
 
