@@ -180,13 +180,6 @@ def rewritten(change):
     return act
 
 
-def filtered(rows):
-    table = np.zeros(len(rows), dtype=[*((n, "f4") for n in rows.dtype.names), ("filter_3D", "f4")])
-    for name in rows.dtype.names:
-        table[name] = rows[name]
-    return table
-
-
 def outside(path):
     """Put thresholds into a column, one of them above 1."""
     write_ply(path, tiny.cut(tiny.random_model(8, degree=1), 0.5))
@@ -208,7 +201,6 @@ BAD = {
         "keeps colours in a network",
     ),
     "odd sh": (lambda path: without(path, "f_rest_8"), "8 f_rest columns"),
-    "mip": (rewritten(filtered), "Mip-Splatting model"),
     "faces": (rewritten(lambda _: np.array([(1,)], dtype=[("a", "i4")])), "without a vertex"),
     "empty": (rewritten(lambda rows: rows[:0]), "0 Gaussians"),
     "thresholds": (outside, "trunc_threshold outside"),

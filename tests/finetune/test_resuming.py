@@ -100,14 +100,6 @@ def test_a_target_time_that_was_cut_off_keeps_what_was_timed(
     require_same(whole, run(model, dataset, settings, path))
 
 
-def test_what_a_caller_decides_is_part_of_the_configuration(model, dataset, tmp_path, monkeypatch):
-    settings, path = Settings(iterations=STEPS), tmp_path / "unfinished"
-    later = Schedule(settings, warmup=6)
-    run(model, dataset, settings, path, cut=5, monkeypatch=monkeypatch, schedule=later)
-    with pytest.raises(CheckpointError, match="with other schedule;"):
-        run(model, dataset, settings, path)
-
-
 def test_photographs_are_read_once_and_a_changed_one_is_noticed(tmp_path, monkeypatch):
     data, _, model = tiny.scene(tmp_path)
     dataset, read, digest = load_dataset(data), [], resuming.digest
@@ -164,42 +156,44 @@ def test_a_signal_waits_for_the_end_of_its_step_and_is_resumed_from_there(
     require_same(whole, result)
 
 
+@pytest.fixture(scope="module")
+def unfinished(model, dataset, tmp_path_factory):
+    """The checkpoint of a fine-tuning of ``STEPS`` steps that was cut off."""
+    path = tmp_path_factory.mktemp("cut") / "out.fragprune-unfinished"
+    with pytest.MonkeyPatch.context() as patch:
+        run(model, dataset, Settings(iterations=STEPS), path, cut=5, monkeypatch=patch)
+    return path
+
+
 @pytest.mark.parametrize(
-    ("changed", "named"),
-    [({"goal": Pressure(1e-3)}, "goal"), ({"seed": 1, "train": "opacity"}, "seed, train")],
+    ("named", "changed"),
+    [
+        ("goal", {"goal": Pressure(1e-3)}),
+        ("seed, train", {"seed": 1, "train": "opacity"}),
+        ("schedule", {}),
+        ("loss", {}),
+        ("model", {}),
+        ("photographs", {}),
+        ("thresholds", {}),
+    ],
 )
 def test_another_configuration_is_refused_and_named(
-    model, dataset, tmp_path, monkeypatch, changed, named
+    model, truth, dataset, unfinished, tmp_path, monkeypatch, named, changed
 ):
-    path = tmp_path / "out.fragprune-unfinished"
-    run(model, dataset, Settings(iterations=STEPS), path, cut=5, monkeypatch=monkeypatch)
-    before = path.read_bytes()
-    with pytest.raises(CheckpointError, match=f"with other {named}; "):
-        run(model, dataset, Settings(iterations=STEPS, **changed), path)
-    assert path.read_bytes() == before
-
-
-def test_another_code_for_the_loss_is_refused(model, dataset, tmp_path, monkeypatch):
-    """Its last bits differ."""
-    settings, path = Settings(iterations=STEPS), tmp_path / "out.fragprune-unfinished"
-    run(model, dataset, settings, path, cut=5, monkeypatch=monkeypatch)
-    monkeypatch.setattr(resuming, "code_for", lambda _: "another")
-    with pytest.raises(CheckpointError, match="with other loss; "):
-        run(model, dataset, settings, path)
-
-
-def test_another_model_photographs_or_thresholds_are_refused(
-    model, truth, dataset, tmp_path, monkeypatch
-):
-    settings, path = Settings(iterations=STEPS), tmp_path / "out.fragprune-unfinished"
-    run(model, dataset, settings, path, cut=5, monkeypatch=monkeypatch)
-    with pytest.raises(CheckpointError, match="other model;"):
-        run(truth, dataset, settings, path)
-    darker = tiny.dataset_in_memory(tmp_path, tiny.random_model(seed=3))
-    with pytest.raises(CheckpointError, match="other photographs;"):
-        run(model, darker, settings, path)
-    with pytest.raises(CheckpointError, match="other thresholds;"):
-        run(tiny.cut(model, 0.1), dataset, settings, path)
+    settings, options, before = Settings(iterations=STEPS, **changed), {}, unfinished.read_bytes()
+    if named == "schedule":  # a caller's own
+        options["schedule"] = Schedule(settings, warmup=6)
+    elif named == "loss":  # other code gives other last bits
+        monkeypatch.setattr(resuming, "code_for", lambda _: "another")
+    elif named == "model":
+        model = truth
+    elif named == "photographs":
+        dataset = tiny.dataset_in_memory(tmp_path, tiny.random_model(seed=3))
+    elif named == "thresholds":
+        model = tiny.cut(model, 0.1)
+    with pytest.raises(CheckpointError, match=f"with other {named};"):
+        run(model, dataset, settings, unfinished, **options)
+    assert unfinished.read_bytes() == before
 
 
 def spoil(path, how):
@@ -264,12 +258,12 @@ def spoil(path, how):
         "pressure.observe: 3",
     ],
 )
-def test_a_broken_checkpoint_is_stated(model, dataset, tmp_path, monkeypatch, how):
-    settings, path = Settings(iterations=STEPS), tmp_path / "out.fragprune-unfinished"
-    run(model, dataset, settings, path, cut=5, monkeypatch=monkeypatch)
+def test_a_broken_checkpoint_is_stated(model, dataset, unfinished, tmp_path, how):
+    path = tmp_path / "out.fragprune-unfinished"
+    path.write_bytes(unfinished.read_bytes())
     spoil(path, how)
     with pytest.raises(CheckpointError) as caught:
-        run(model, dataset, settings, path)
+        run(model, dataset, Settings(iterations=STEPS), path)
     assert "--again" in caught.value.remedy
 
 
@@ -293,7 +287,5 @@ def test_time_decides_when_a_checkpoint_is_due(tmp_path):
     assert Checkpoints(tmp_path / "x", seconds=0.0).due(1)
     assert not Checkpoints(tmp_path / "x", seconds=3600.0).due(1)
     assert not Checkpoints(tmp_path / "x", seconds=None).due(1)
-    assert [step for step in range(1, 8) if Checkpoints(tmp_path / "x", None, 3).due(step)] == [
-        3,
-        6,
-    ]
+    third = Checkpoints(tmp_path / "x", None, 3)
+    assert [step for step in range(1, 8) if third.due(step)] == [3, 6]

@@ -160,6 +160,13 @@ def transforms(names: list[str], chosen: list[Camera]) -> dict[str, object]:
     return {"camera_angle_x": 2 * math.atan(SIDE / (2 * FOCAL)), "frames": frames}
 
 
+def write_path(path: Path, names: list[str], width: int = 20, height: int = 12) -> Path:
+    """A transforms file of the first cameras, as a path for a film is one."""
+    content = transforms(names, cameras()[: len(names)]) | {"w": width, "h": height}
+    path.write_text(json.dumps(content))
+    return path
+
+
 def write_blender(folder: Path, images: list[torch.Tensor]) -> Path:
     """transforms_train.json and transforms_test.json, held-out views as COLMAP's reader takes."""
     for part in ("train", "test"):
