@@ -1,6 +1,7 @@
 """Running a command in this process, and what every one of them promises."""
 
 import json
+from pathlib import Path
 
 from click.testing import CliRunner, Result
 
@@ -22,3 +23,17 @@ def finetune_words(scene: tuple, out: object, *more: object) -> tuple:
     """A short fine-tuning of a model on its photographs."""
     data, path = scene
     return ("finetune", path, "--data", data, "--out", out, "--iters", 20, *more)
+
+
+def drawing(data: Path, path: Path, cameras: Path, out: Path) -> dict[str, tuple]:
+    """Commands that draw a model, and what each needs."""
+    return {
+        "finetune": (path, "--data", data, "--out", out / "small.ply", "--iters", 2),
+        "render": (path, "--data", data, "--out", out),
+        "profile": (path, "--data", data, "--out", out),
+        "compare": (path, path, "--data", data, "--out", out),
+        "bench": (path, "--cameras", cameras, "--size", "32x32"),
+    }
+
+
+DRAWING = ("finetune", "render", "profile", "compare", "bench")

@@ -145,10 +145,3 @@ def test_two_sources_of_cameras_are_refused(model, tmp_path, side):
     assert result.exit_code == 2
     assert f"--data with {side}" in result.stderr
     assert not (tmp_path / "out").exists()
-
-
-def test_a_model_that_is_none_is_refused(tmp_path):
-    (tmp_path / "model.ply").write_text("no model")
-    result = run("audit", tmp_path / "model.ply", "--out", tmp_path / "out", "--json")
-    assert result.exit_code == 1
-    assert json.loads(result.stdout)["error"]["code"] == "model-file"

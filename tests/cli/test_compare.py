@@ -1,7 +1,6 @@
 """fragprune compare."""
 
 import importlib
-import json
 
 import pytest
 import torch
@@ -55,9 +54,7 @@ def test_without_photographs_b_is_compared_with_what_a_shows(tmp_path):
     _, path, model = tiny.scene(tmp_path)
     other = tmp_path / "other.ply"
     write_ply(other, tiny.cut(model, 0.3))
-    cameras = tmp_path / "cameras.json"
-    content = tiny.transforms([f"v{i}" for i in range(9)], tiny.cameras()) | {"w": 24, "h": 16}
-    cameras.write_text(json.dumps(content))
+    cameras = tiny.write_path(tmp_path / "path.json", [f"v{i}" for i in range(9)], 24, 16)
     report = run_json("compare", path, other, "--cameras", cameras)
     views = [view for name, view in load_cameras(cameras) if name in ("v0", "v8")]
     thresholds = torch.full((len(model),), 0.3)

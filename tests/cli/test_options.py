@@ -1,7 +1,5 @@
 """What commands make of words that are misspelt, missing or without effect."""
 
-import json
-
 import pytest
 from cli.commands import run, run_json
 from finetune import tiny
@@ -41,20 +39,11 @@ def test_a_model_that_is_not_there_is_what_is_wrong(name, tmp_path):
     assert not out.exists()
 
 
-def test_a_report_of_a_folder_that_is_not_there(tmp_path):
-    result = run("report", tmp_path / "nowhere")
-    assert result.exit_code == 1
-    assert "no such folder" in result.stderr
-
-
 @pytest.fixture
 def given(tmp_path):
     """A model, and its cameras in a file."""
     _, path, _ = tiny.scene(tmp_path)
-    content = tiny.transforms(["a", "b"], tiny.cameras()[:2]) | {"w": 20, "h": 12}
-    cameras = tmp_path / "path.json"
-    cameras.write_text(json.dumps(content))
-    return path, cameras
+    return path, tiny.write_path(tmp_path / "path.json", ["a", "b"])
 
 
 def test_cameras_of_a_file_are_divided(given, tmp_path):

@@ -54,9 +54,7 @@ def test_a_film_is_not_drawn_by_several_processes(cut_scene, tmp_path, single_th
 
 def test_cameras_file_and_views(cut_scene, tmp_path):
     data, path = cut_scene
-    content = tiny.transforms(["a", "b"], tiny.cameras()[:2]) | {"w": 20, "h": 12}
-    cameras = tmp_path / "path.json"
-    cameras.write_text(json.dumps(content))
+    cameras = tiny.write_path(tmp_path / "path.json", ["a", "b"])
     out = tmp_path / "pictures"
     result = run("render", path, "--cameras", cameras, "--out", out)
     assert result.exit_code == 0
@@ -69,10 +67,9 @@ def test_cameras_file_and_views(cut_scene, tmp_path):
 
 def test_two_views_of_one_name_are_two_pictures(cut_scene, tmp_path):
     _, path = cut_scene
-    content = tiny.transforms(["train/r_0", "test/r_0"], tiny.cameras()[:2]) | {"w": 20, "h": 12}
-    (tmp_path / "path.json").write_text(json.dumps(content))
+    cameras = tiny.write_path(tmp_path / "path.json", ["train/r_0", "test/r_0"])
     out = tmp_path / "pictures"
-    report = run_json("render", path, "--cameras", tmp_path / "path.json", "--out", out)
+    report = run_json("render", path, "--cameras", cameras, "--out", out)
     assert sorted(file.name for file in out.iterdir()) == ["r_0-2.png", "r_0.png"]
     assert len(set(report["files"])) == 2
     assert report["warnings"] == []

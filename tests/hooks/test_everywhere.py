@@ -1,11 +1,10 @@
 """Thresholds, an engine, a schedule of a plugin: alike in every command and function that draws."""
 
-import json
 from dataclasses import replace
 
 import pytest
 import torch
-from cli.commands import run, run_json
+from cli.commands import DRAWING, drawing, run, run_json
 from finetune import tiny
 
 import fragprune_plugins
@@ -68,21 +67,8 @@ def scene(tmp_path):
     with torch.no_grad():
         store.logits.copy_(torch.logit(torch.full((len(model),), 0.3)))
     sidecar.save(path, store)
-    cameras = tmp_path / "path.json"
-    content = tiny.transforms(["a"], tiny.cameras()[:1]) | {"w": 32, "h": 32}
-    cameras.write_text(json.dumps(content))
+    cameras = tiny.write_path(tmp_path / "path.json", ["a"], 32, 32)
     return data, path, cameras, tmp_path / "out"
-
-
-COMMANDS = {
-    "finetune": lambda data, path, cameras, out: (
-        *(path, "--data", data, "--out", out / "small.ply", "--iters", 2),
-    ),
-    "render": lambda data, path, cameras, out: (path, "--data", data, "--out", out),
-    "profile": lambda data, path, cameras, out: (path, "--data", data, "--out", out),
-    "compare": lambda data, path, cameras, out: (path, path, "--data", data, "--out", out),
-    "bench": lambda data, path, cameras, out: (path, "--cameras", cameras, "--size", "32x32"),
-}
 
 
 def drawn(report):
@@ -93,13 +79,13 @@ def drawn(report):
     return [part["fragments_per_pixel"] for part in parts]
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", DRAWING)
 def test_every_command_draws_with_a_plugins_engine_and_thresholds(command, scene, plug):
-    assert min(drawn(run_json(command, *COMMANDS[command](*scene)))) > 0
+    assert min(drawn(run_json(command, *drawing(*scene)[command]))) > 0
     mine = Mine()
     plug(mine, "engine")
     plug(Fixed(), "thresholds")
-    report = run_json(command, *COMMANDS[command](*scene), "--engine", "mine")
+    report = run_json(command, *drawing(*scene)[command], "--engine", "mine")
     assert max(drawn(report)) == 0
     row = report["results"][0] if "results" in report else report
     row = row["columns"]["truncated"] if "columns" in row else row
@@ -109,21 +95,21 @@ def test_every_command_draws_with_a_plugins_engine_and_thresholds(command, scene
 
 def test_report_draws_with_a_plugins_engine_and_thresholds(scene, plug):
     data, _, _, out = scene
-    run_json("finetune", *COMMANDS["finetune"](*scene))
+    run_json("finetune", *drawing(*scene)["finetune"])
     mine = Mine()
     plug(mine)
     run_json("report", out, "--data", data, "--engine", "mine")
     assert mine.frames > 0
 
 
-@pytest.mark.parametrize("command", [*COMMANDS, "run", "demo"])
+@pytest.mark.parametrize("command", [*DRAWING, "run", "demo"])
 def test_an_unknown_engine_is_refused_with_those_that_are_known(command, scene, plug, tmp_path):
     plug(Mine(), "my_plugin")
     others = {
         "run": ("--", "python", HOST, "-s", "x", "-m", tmp_path / "m"),
         "demo": ("--out", tmp_path / "demo"),
     }
-    words = others[command] if command in others else COMMANDS[command](*scene)
+    words = (drawing(*scene) | others)[command]
     result = run(command, "--engine", "mime", *words)
     assert result.exit_code == 1
     assert result.stderr.count("[engine] engine: 'mime'; expected one of auto, reference, cpu") == 1
