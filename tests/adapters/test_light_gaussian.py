@@ -2,7 +2,6 @@
 
 import copy
 import shutil
-import sys
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,7 +16,6 @@ from miniatures.vanilla_3dgs import Notes, expect_ancestors, joint, label, runni
 from oracle import naive
 
 from fragprune_light_gaussian import LightGaussian
-from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.hosts.adapter import optimizer_state
@@ -273,10 +271,3 @@ def test_flags_of_distillation_are_left_out_of_what_resumes_it():
     assert arguments == [*shared, "--sh_degree", "1"]
     for name in ("x/train_densify_prune.py", "x/prune_finetune.py"):
         assert LightGaussian().resumed_by(Path(name), words) == (Path(name), words)
-
-
-def test_nothing_to_start_from_is_said(mini, photographs, tmp_path):
-    words = command(mini, "prune_finetune.py", photographs, tmp_path, 5)
-    with pytest.raises(UsageError, match="no model in"):
-        run(words, RunOptions(device="cpu", stage="finetune"))
-    assert "train_densify_prune" not in sys.modules

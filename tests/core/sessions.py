@@ -1,5 +1,7 @@
 """A session's state over a host that is three lines long, to call its handlers by hand."""
 
+import inspect
+import weakref
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -64,17 +66,8 @@ def follow(session: SessionState, count: int = 6) -> tuple[Model, ModelState]:
     model = Model(count)
     store = ThresholdStore(count)
     numbers = torch.arange(float(count))
-    store.load_state_dict(
-        {
-            "logits": -3 + numbers / 8,
-            "exp_avg": 1 + numbers,
-            "exp_avg_sq": 1 + numbers,
-            "adam_step": 2.0,
-            "steps": 2,
-        }
-    )
-    import weakref
-
+    moments = {"exp_avg": 1 + numbers, "exp_avg_sq": 1 + numbers}
+    store.load_state_dict({"logits": -3 + numbers / 8, **moments, "adam_step": 2.0, "steps": 2})
     known = session.models[model] = ModelState(store)
     session.optimizers[model] = [weakref.ref(model.optimizer)]
     return model, known
@@ -82,8 +75,6 @@ def follow(session: SessionState, count: int = 6) -> tuple[Model, ModelState]:
 
 def call(model, role, function, *args, how=None) -> SeamCall:
     """A call of a host's function, with its first parameter as what the seam needs."""
-    import inspect
-
     needs = tuple(inspect.signature(function).parameters)
     how = how or (lambda call: None)
     return SeamCall(Seam(role, "host", "f", needs, how=how), function, model, args, {}, model=model)

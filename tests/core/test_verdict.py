@@ -192,17 +192,13 @@ def test_a_model_in_another_module_is_named(fork, tmp_path):
     assert "GaussianModel is in scene.gaussian_model_other" in verdict.differs
 
 
-def test_a_folder_that_fits_is_named_at_the_root(tmp_path):
-    skeleton(tmp_path / "inner")
+@pytest.mark.parametrize("folder", ["inner", "a/b/inner"])
+def test_a_folder_that_fits_is_named_at_the_root(tmp_path, folder):
+    skeleton(tmp_path / folder)
     verdict = judged(HostRepo(tmp_path))
     assert verdict.kind == "inside"
-    assert f"fragprune check {tmp_path / 'inner'}" in verdict.sentence
-
-
-def test_a_folder_deep_inside_that_fits_is_named_by_its_path(tmp_path):
-    skeleton(tmp_path / "a/b/inner")
-    verdict = judged(HostRepo(tmp_path))
-    assert verdict.inside == (("a/b/inner", "vanilla-3dgs"),)
+    assert verdict.inside == ((folder, "vanilla-3dgs"),)
+    assert f"fragprune check {tmp_path / folder}" in verdict.sentence
 
 
 def test_a_picture_cut_out_of_further_channels_is_not_the_plys(fork):

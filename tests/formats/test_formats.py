@@ -208,8 +208,6 @@ def test_a_turned_scene_looks_the_same_from_a_turned_camera():
 
 
 def test_sog_beside_its_images(tmp_path):
-    import zipfile
-
     splat = random_splat(60, 1, 0)
     store = ThresholdStore.from_falloff(torch.linspace(0.01, 0.9, 60))
     save(tmp_path / "a.sog", replace(splat, thresholds=store))
@@ -224,10 +222,14 @@ def test_sog_beside_its_images(tmp_path):
         load(meta)
 
 
+def with_records(content: bytes, flags: int, records: bytes) -> bytes:
+    """An SPZ with records between its head and its table, and flags that say so."""
+    head = content[:14] + bytes([flags]) + content[15:16] + struct.pack("<I", 32 + len(records))
+    return head + content[20:32] + records + content[32:]
+
+
 def test_spz_names_its_axes(tmp_path):
     """The record that says RUB turns y and z; one that exchanges axes is refused."""
-    import struct
-
     path = tmp_path / "a.spz"
     splat = random_splat(5, 1, 0)
     save(path, splat)
@@ -235,11 +237,9 @@ def test_spz_names_its_axes(tmp_path):
 
     def axes(system):
         record = struct.pack("<III", 0xADBE0003, 4, system)
-        head = content[:14] + b"\x02" + content[15:16] + struct.pack("<I", 32 + len(record))
-        path.write_bytes(head + content[20:32] + record + content[32:])
+        path.write_bytes(with_records(content, 2, record))
         return load(path)
 
-    path.write_bytes(content)
     plain = load(path)
     assert torch.equal(axes(6).xyz, plain.xyz)
     assert torch.equal(axes(4).xyz, plain.xyz * torch.tensor([1.0, -1.0, -1.0]))
@@ -248,24 +248,19 @@ def test_spz_names_its_axes(tmp_path):
 
 
 def test_what_is_not_followed_is_named(tmp_path, caplog):
-    import struct
-
     path = tmp_path / "a.spz"
     save(path, random_splat(5, 1, 0))
     content = path.read_bytes()
     assert load(path)
     assert not caplog.messages
     record = struct.pack("<II", 0xADBE0002, 12) + bytes(12)
-    head = content[:14] + b"\x03" + content[15:16] + struct.pack("<I", 32 + len(record))
-    path.write_bytes(head + content[20:32] + record + content[32:])
+    path.write_bytes(with_records(content, 3, record))
     assert load(path)
     assert "antialiasing" in caplog.messages[0]
     assert "0xadbe0002" in caplog.messages[1]
 
 
 def test_more_gaussians_than_a_file_can_hold_are_not_allocated(tmp_path):
-    import struct
-
     from fragprune_plugins.workbench.models.formats.spz import zstd
 
     path, count = tmp_path / "a.spz", 100_000_000

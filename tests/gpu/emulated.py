@@ -95,3 +95,17 @@ class EmulatedDevice:
         mine = path.with_name(f"{os.getpid()}-{path.name}")  # others may be at the same
         subprocess.run([self.compiler, *FLAGS, *arguments, "-o", str(mine)], check=True)
         mine.replace(path)
+
+
+class BrokenDevice(EmulatedDevice):
+    """Takes its kernels from broken.cu."""
+
+    def source(self, name: str) -> str:
+        """The file of all of them."""
+        return str(HERE / "broken.cu")
+
+
+class Numbers(ctypes.Structure):
+    """What the kernels of broken.cu take."""
+
+    _fields_ = (("to", ctypes.c_void_p),)

@@ -16,7 +16,7 @@ from unittest import mock
 
 import scenes
 import torch
-from gpu.emulated import EmulatedDevice
+from gpu.emulated import BrokenDevice, EmulatedDevice, Numbers
 from native.test_dialects import dialect
 from native.test_invariants import everything
 from spacetime import cut, moment, splats
@@ -111,19 +111,8 @@ def draw(device: EmulatedDevice, seed: int) -> None:
     (result.means.sum() + result.cov3d.sum() + result.opacities.sum()).backward()
 
 
-class Broken(EmulatedDevice):
-    """Takes its kernels from broken.cu."""
-
-    def source(self, name: str) -> str:
-        return str(Path(__file__).with_name("broken.cu"))
-
-
 def run_broken(device: EmulatedDevice, kernel: str) -> None:
     """One of the kernels of broken.cu, in three blocks."""
-
-    class Numbers(ctypes.Structure):
-        _fields_ = (("to", ctypes.c_void_p),)
-
     where = torch.device("cpu")
     arena = frame.Arena(where, torch.zeros, numbers=4 * 3 * 256, others=4 * 256)
     device.launch(where, "broken", {}, kernel, 3, Numbers(to=arena["numbers"]))
@@ -150,7 +139,7 @@ def main() -> None:
     del os.environ["LD_PRELOAD"]  # the compiler does without
     arena = GuardedArena if asked.kind == "address" else frame.Arena
     with tempfile.TemporaryDirectory() as folder, mock.patch.object(frame, "Arena", arena):
-        kind = Broken if asked.broken else EmulatedDevice
+        kind = BrokenDevice if asked.broken else EmulatedDevice
         device = kind(asked.compiler, Path(folder), ("-g1", *flags))
         device.resident = asked.resident
         if asked.broken:

@@ -1,24 +1,8 @@
 """The emulation notices what it is there to notice."""
 
-import ctypes
-from pathlib import Path
-
 import pytest
 import torch
-from gpu.emulated import EmulatedDevice
-
-
-class Numbers(ctypes.Structure):
-    """Numbers of broken.cu."""
-
-    _fields_ = (("to", ctypes.c_void_p),)
-
-
-class BrokenDevice(EmulatedDevice):
-    """Takes its kernels from broken.cu."""
-
-    def source(self, name: str) -> str:
-        return str(Path(__file__).with_name("broken.cu"))
+from gpu.emulated import BrokenDevice, EmulatedDevice, Numbers
 
 
 @pytest.fixture(scope="module")

@@ -53,6 +53,15 @@ def cameras(count: int = 1):
     return viewmats, K.repeat(count, 1, 1)
 
 
+def attached(count: int = 40, seed: int = 0):
+    """(params, optimizers) that a session knows, because a strategy has looked at them."""
+    from gsplat import DefaultStrategy
+
+    params, optimizers = new_params(count, seed=seed)
+    DefaultStrategy().check_sanity(params, optimizers)
+    return params, optimizers
+
+
 def draw(params, count: int = 1, **options):
     viewmats, Ks = cameras(count)
     return drawn_by_gsplat(
@@ -262,10 +271,7 @@ def test_a_target_is_met_over_every_camera_of_a_call(session_on, count):
     """The cameras see ever less, so that no one of them could speak for all."""
     settings = Settings(iterations=8, threshold_lr=0.3, goal=Fewer(1.5), train="opacity")
     with session_on(Gsplat(), settings=settings) as session:
-        from gsplat import DefaultStrategy
-
-        params, optimizers = new_params(40)
-        DefaultStrategy().check_sanity(params, optimizers)
+        params, optimizers = attached()
         viewmats, Ks = cameras(count)
         viewmats[:, 2, 3] *= torch.arange(count) * 4 + 1
 
@@ -300,11 +306,9 @@ def test_a_target_is_met_without_views_drawn_before_rows_changed(session_on):
     settings = Settings(iterations=8, goal=Fewer(1.5), train="opacity")
     schedule = JointSchedule(settings, 1)
     with session_on(Gsplat(), settings=settings, schedule=schedule, freeze=False) as session:
-        from gsplat import DefaultStrategy
         from gsplat.strategy.ops import remove
 
-        params, optimizers = new_params(40)
-        DefaultStrategy().check_sanity(params, optimizers)
+        params, optimizers = attached()
         for step in range(8):
             draw(params, 2 if step < 3 else 1)[0].mean().backward()
             for parameter in params.values():
@@ -341,17 +345,11 @@ def test_thresholds_of_a_file_wait_while_another_model_is_drawn(session_on, tmp_
     """They are not forgotten: to draw the file's Gaussians without them stays an error."""
     file = tmp_path / "splats.pt"
     with session_on(Gsplat()) as session:
-        from gsplat import DefaultStrategy
-
-        params, optimizers = new_params(40)
-        DefaultStrategy().check_sanity(params, optimizers)
+        params, _ = attached()
         session.store(params).logits = torch.randn(40).requires_grad_(True)
         torch.save(params.state_dict(), file)
     with session_on(Gsplat()) as session, torch.no_grad():
-        from gsplat import DefaultStrategy
-
-        known, optimizers = new_params(40, seed=1)
-        DefaultStrategy().check_sanity(known, optimizers)
+        known, _ = attached(seed=1)
         assert session.store(known) is not None
         saved = torch.load(file)
         draw(known)
@@ -371,10 +369,7 @@ def test_torch_saves_and_loads_parameters_with_their_thresholds(
         return saved["splats"] if nested else saved
 
     with session_on(Gsplat()) as session:
-        from gsplat import DefaultStrategy
-
-        params, optimizers = new_params(40)
-        DefaultStrategy().check_sanity(params, optimizers)
+        params, _ = attached()
         session.store(params).logits = logits.clone().requires_grad_(True)
         state = params.state_dict()
         torch.save({"step": 3, "splats": state} if nested else state, file)
@@ -399,10 +394,7 @@ def test_torch_saves_and_loads_parameters_with_their_thresholds(
 
 def test_a_file_that_was_read_for_something_else_changes_nothing(session_on, tmp_path):
     with session_on(Gsplat()) as session:
-        from gsplat import DefaultStrategy
-
-        params, optimizers = new_params(40)
-        DefaultStrategy().check_sanity(params, optimizers)
+        params, _ = attached()
         session.store(params).logits = torch.randn(40).requires_grad_(True)
         torch.save(params.state_dict(), tmp_path / "other.pt")
         with torch.no_grad():

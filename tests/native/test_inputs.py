@@ -154,16 +154,19 @@ def draw(library: binding.Library, inputs: binding.Inputs) -> tuple[int, str]:
     return status, error.message.decode()
 
 
+THREADS, COEFFICIENTS = "threads must be 1 to 1024", "sh_coefficients must be 0 to 1024"
+
+
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ({"stop": 0.5e-4}, "stop must be"),
-        ({"stop": -0.1}, "stop must be"),
-        ({"stop": float("nan")}, "stop must be"),
+        *(({"stop": stop}, "stop must be") for stop in (0.5e-4, -0.1, float("nan"))),
         ({"stop": 0.1, "alpha_max": 1.0}, "alpha_max must be"),
+        *(({"threads": count}, THREADS) for count in (0, -5, 1025)),
+        *(({"sh_coefficients": count}, COEFFICIENTS) for count in (-1, 1025, 2**31 - 1)),
     ],
 )
-def test_a_stop_that_cannot_be_is_refused(
+def test_a_number_that_cannot_be_is_refused(
     library: binding.Library, given: dict[str, float], said: str
 ) -> None:
     inputs = native_inputs(WORLD, arrays := native_arrays(WORLD, None), widen=False)
@@ -232,25 +235,6 @@ def test_a_cut_of_arrays_of_another_length_is_refused_by_name(library: binding.L
     splats = spacetime.leaves(spacetime.splats("joint", N), torch.float32)
     slice_by(blade, splats, spacetime.moment()).means.sum().backward()
     assert blade.refused == 2 * 10  # there and back
-
-
-@pytest.mark.parametrize("counts", [{"threads": 0}, {"threads": -5}, {"threads": 1025}])
-def test_absurd_counts_of_threads_are_refused(library: binding.Library, counts: dict) -> None:
-    given = native_inputs(WORLD, native_arrays(WORLD, None), widen=False, **counts)
-    status, message = draw(library, given)
-    assert status != binding.OK
-    assert message == "threads must be 1 to 1024"
-
-
-@pytest.mark.parametrize("coefficients", [-1, 1025, 2**31 - 1])
-def test_absurd_counts_of_coefficients_are_refused(
-    library: binding.Library, coefficients: int
-) -> None:
-    given = native_inputs(WORLD, native_arrays(WORLD, None), widen=False)
-    given.sh_coefficients = coefficients
-    status, message = draw(library, given)
-    assert status != binding.OK
-    assert message == "sh_coefficients must be 0 to 1024"
 
 
 def test_memory_resized_behind_the_checks_is_not_read(engine: CpuEngine) -> None:

@@ -1,6 +1,5 @@
 """Thresholds: what they cut, what they must leave alone, and what gradient they get."""
 
-import math
 from dataclasses import replace
 
 import pytest
@@ -97,21 +96,6 @@ def test_a_fragment_is_drawn_exactly_down_to_its_threshold():
     for factor, drawn in ((1 - 1e-9, 1), (1 + 1e-9, 0)):
         tau = torch.tensor([falloff * factor], dtype=F64)
         assert draw(scene, tau).fragments[8, 11] == drawn
-
-
-def test_thresholds_act_on_falloff_and_not_on_opacity():
-    tau = torch.tensor([0.2], dtype=F64)
-    counts = {draw(scenes.one_splat(opacity=o, dtype=F64), tau).fragments.sum() for o in (0.1, 0.9)}
-    assert len({int(c) for c in counts}) == 1
-
-
-def test_the_visibility_skip_uses_the_compensated_opacity():
-    scene = scenes.one_splat(sigma=(0.6, 0.6), opacity=0.5, dtype=F64)
-    scene = replace(scene, compensation="antialiasing")
-    dim = 0.5 * 0.36 / 0.66
-    reach = math.sqrt(0.66 * 2 * math.log(255 * dim))
-    inside = sum(math.hypot(x - 8, y - 8) <= reach for x in range(17) for y in range(17))
-    assert draw(scene, torch.tensor([1e-6]).double()).fragments.sum() == inside
 
 
 @pytest.mark.parametrize("pixel", [(5, 6), (17, 3), (20, 15)])

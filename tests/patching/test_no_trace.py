@@ -62,16 +62,6 @@ def host_of(folder: Path, does: str = "") -> Path:
     return script
 
 
-def after_nothing(folder: Path) -> tuple[int, list[str]]:
-    """Activate and deactivate; the number of objects, and what differs."""
-    root = host_of(folder).parent
-    warm_up()
-    before = Snapshot()
-    fragprune_plugins.activate(host=root, stage="joint")
-    assert fragprune_plugins.deactivate() == []
-    return len(before.objects), before.differences()
-
-
 def after_run(folder: Path, scene: Path, name: str) -> tuple[int, list[str]]:
     """Run the host; the number of objects, and what differs."""
     stage, does, ends = RUNS[name]
@@ -100,12 +90,6 @@ def after_run(folder: Path, scene: Path, name: str) -> tuple[int, list[str]]:
     stay += [module for module in sys.modules if "diff_gaussian" in module]
     streams = (out / "streams").read_text().splitlines()
     return len(before.objects), before.differences(streams) + stay
-
-
-def test_activating_and_deactivating_leaves_no_trace(tmp_path):
-    count, differences = fresh(after_nothing, tmp_path)
-    assert count > OBJECTS
-    assert differences == [], "\n".join(differences)
 
 
 @pytest.mark.parametrize("name", RUNS)
