@@ -20,7 +20,6 @@ from fragprune_4dgaussians import MovingGaussians
 from fragprune_4dgaussians.config import PythonFile
 from fragprune_plugins.errors import HostFailed, ModelFileError, UsageError
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.testing.host import joint, running
@@ -124,13 +123,6 @@ def test_joint_learning_counts_fine_iterations_and_follows_rows(mini, photograph
     assert summary.iterations == LAST - 1
     assert store.steps == LAST - 1 - 3
     assert len(store) == summary.gaussians != 150
-
-
-def test_the_end_of_densification_is_that_of_the_command(mini):
-    adapter, repo = MovingGaussians(), HostRepo(mini)
-    script = mini / "train.py"
-    assert adapter.densified(repo, script, ["--densify_until_iter", "77"]) == 77
-    assert adapter.densified(repo, script, []) == 15_000
 
 
 def test_a_newer_checkpoint_of_the_first_phase_is_no_start(mini, photographs, output):

@@ -7,12 +7,14 @@ from miniatures.lp_3dgs import LPHost
 from miniatures.mcmc import MCMCHost
 from miniatures.mini_splatting import MiniSplattingHost
 from miniatures.mip_splatting import MipHost
+from miniatures.moving import MovingHost
 from miniatures.rain_gs import RainHost
 from miniatures.rt_4dgs import RT4DGSHost
 from miniatures.runs import command, written
 from miniatures.speedy_splat import SpeedyHost
 from miniatures.vanilla_3dgs import HOST
 
+from fragprune_4dgaussians import MovingGaussians
 from fragprune_compact_3dgs import Compact3DGS
 from fragprune_light_gaussian import LightGaussian
 from fragprune_lp_3dgs import LP3DGS
@@ -43,6 +45,7 @@ UNTIL = ("--densify_until_iter", "700")
         (RainGS, RainHost, [*UNTIL, "--warmup_iter", "50"], 750),
         (RainGS, RainHost, [*UNTIL, "--ours_new"], 10_700),
         (RT4DGS, RT4DGSHost, [*UNTIL], 700),
+        (MovingGaussians, MovingHost, [*UNTIL], 700),
         (LightGaussian, LightGaussianHost, [*UNTIL], 16_000),
         (LightGaussian, LightGaussianHost, [*UNTIL, "--prune_iterations", "80", "90"], 700),
         (LightGaussian, LightGaussianHost, [*UNTIL, "--prune_iterations", "80", "990"], 990),
