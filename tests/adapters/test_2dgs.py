@@ -1,28 +1,21 @@
 """2D Gaussian Splatting: surfels and their maps, on a miniature of the host."""
 
-import numpy as np
 import pytest
 import torch
 from cli.commands import run_json
-from miniatures.runs import OPTIONS, check_stage_two, command, miniature
+from miniatures.runs import OPTIONS, check_measured, check_stage_two, command, miniature
 from miniatures.surfels import SurfelHost
 from miniatures.vanilla_3dgs import Notes, joint
-from PIL import Image
 
 from fragprune_2dgs import SurfelSplatting
-from fragprune_plugins import rasterize
 from fragprune_plugins.engines.reference import ReferenceEngine
-from fragprune_plugins.errors import InputError, ModelFileError, UsageError
+from fragprune_plugins.errors import InputError, UsageError
 from fragprune_plugins.files import records, sidecar
-from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.injection import process
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.goals import Portable
 from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.workbench.commands.options import EngineOptions
-from fragprune_plugins.workbench.figures.evaluate import Candidate
-from fragprune_plugins.workbench.run.work import measure_models, photographs_of
-from fragprune_plugins.workbench.scenes.dataset import load_dataset
+from fragprune_plugins.workbench.run.work import photographs_of
 
 COUNT = 16
 
@@ -103,17 +96,8 @@ def test_stage_two_moves_opacities_and_thresholds_alone(trained):
 def test_we_measure_the_picture_that_the_hosts_own_script_renders(mini, trained, photographs):
     summary, _, out = trained
     run([str(mini / "render.py"), "-m", str(out), "--skip_train"], OPTIONS)
-    (theirs,) = (out / "test" / "ours_29" / "renders").glob("*.png")
-    values = sidecar.load(summary.model_after)[0].values.detach()
-    candidate = Candidate(read(summary.model_after), summary.drawing)
-    (shot,) = load_dataset(photographs).test
-    with torch.no_grad():
-        image = rasterize(candidate.inputs(shot.view, candidate.model.splats()), values).image
-    pixels = (image.clamp(0, 1) * 255 + 0.5).byte().permute(1, 2, 0).numpy()
-    away = np.abs(pixels.astype(int) - np.asarray(Image.open(theirs)))
-    assert away.max() <= 1  # a camera's float32, rounded
-    before, after = measure_models(photographs_of(summary), EngineOptions())
-    assert after["fragments_per_pixel"] < before["fragments_per_pixel"]
+    (picture,) = (out / "test" / "ours_29" / "renders").glob("*.png")
+    check_measured(summary, picture, photographs, read)
 
 
 def test_compare_draws_its_models_by_their_record(trained):
@@ -140,11 +124,3 @@ def test_portable_is_refused(mini, photographs, trained, tmp_path):
     )
     with pytest.raises(InputError, match="surfels"):
         run(words, options)
-
-
-# -- its PLY elsewhere ---------------------------------------------------------------------------
-
-
-def test_reading_its_model_as_3d_gaussians_says_what_it_is(trained):
-    with pytest.raises(ModelFileError, match=r"2D Gaussian Splatting.*fragprune run"):
-        read_ply(trained[0].model_before)

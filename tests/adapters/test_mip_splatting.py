@@ -3,24 +3,24 @@
 import shutil
 import sys
 
-import numpy as np
 import pytest
 import torch
 from miniatures.mip_splatting import MipHost
-from miniatures.runs import OPTIONS, check_stage_two, command, frozen_differences, miniature
+from miniatures.runs import (
+    OPTIONS,
+    check_measured,
+    check_stage_two,
+    command,
+    frozen_differences,
+    miniature,
+)
 from miniatures.vanilla_3dgs import Notes, joint, label, running
-from PIL import Image
 
 from fragprune_mip_splatting import MipSplatting
-from fragprune_plugins import rasterize
 from fragprune_plugins.errors import NotComparedError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
-from fragprune_plugins.workbench.commands.options import EngineOptions
-from fragprune_plugins.workbench.figures.evaluate import Candidate
-from fragprune_plugins.workbench.run.work import measure_models, photographs_of
-from fragprune_plugins.workbench.scenes.dataset import load_dataset
 
 COUNT = 16
 
@@ -85,9 +85,6 @@ def test_a_gradient_that_equals_the_quantile_counts_as_the_host_counts_it(mini):
             assert len(host.store(model)) == COUNT + expected
 
 
-# -- files ---------------------------------------------------------------------------------------
-
-
 # -- whole runs ----------------------------------------------------------------------------------
 
 
@@ -110,18 +107,8 @@ def test_we_measure_the_picture_that_the_hosts_own_script_renders(mini, trained,
     summary, _, out = trained
     assert summary.drawing == {"dilation": 0.2, "compensation": "mip"}
     run([str(mini / "render.py"), "-m", str(out), "--skip_train"], OPTIONS)
-    folder = out / "test" / "ours_29" / "test_preds_1"
-    values = sidecar.load(summary.model_after)[0].values.detach()
-    candidate = Candidate(MipSplatting().read_model(summary.model_after), summary.drawing)
-    (shot,) = load_dataset(photographs).test
-    with torch.no_grad():
-        image = rasterize(candidate.inputs(shot.view, candidate.model.splats()), values).image
-    pixels = (image.clamp(0, 1) * 255 + 0.5).byte().permute(1, 2, 0).numpy()
-    theirs = np.asarray(Image.open(folder / "00000.png"))
-    assert np.abs(pixels.astype(int) - theirs).max() <= 1  # a camera's float32, rounded
-    assert (pixels != theirs).mean() < 0.05
-    before, after = measure_models(photographs_of(summary), EngineOptions())
-    assert after["fragments_per_pixel"] < before["fragments_per_pixel"]
+    picture = out / "test" / "ours_29" / "test_preds_1" / "00000.png"
+    check_measured(summary, picture, photographs, MipSplatting().read_model)
 
 
 @pytest.mark.parametrize(("flag", "kernel"), [((), 0.1), (("--kernel_size=0.3",), 0.3)])

@@ -17,7 +17,6 @@ from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
-from fragprune_plugins.injection.stand_ins import runs_here
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.run.work import measure_models, photographs_of
@@ -38,18 +37,6 @@ def test_our_rasterizer_answers_before_anything_is_compiled_and_leaves_again(min
         renderer = import_module("gaussian_renderer")
         assert renderer.GaussianRasterizer is ours.GaussianRasterizer
     assert PACKAGE not in sys.modules
-
-
-def test_the_hosts_own_rasterizer_is_used_where_it_can_be_compiled(mini, monkeypatch):
-    import torch.utils.cpp_extension as extension
-
-    dialect = RainGS().dialect(HostRepo(mini))
-    for compiler, gpu in ((None, True), ("/usr/local/cuda", False), ("/usr/local/cuda", True)):
-        monkeypatch.setattr(extension, "CUDA_HOME", compiler)
-        monkeypatch.setattr(torch.cuda, "is_available", lambda gpu=gpu: gpu)
-        assert runs_here(dialect, "submodules") == bool(compiler and gpu)
-        assert runs_here(dialect, "torch")
-        assert not runs_here(dialect, "simple_knn")
 
 
 def test_dilation_reaches_the_engine_and_depth_comes_back_without_a_gradient(mini):

@@ -10,9 +10,7 @@ from scenes import blended
 
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import AlignmentError, UsageError
-from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
-from fragprune_plugins.injection.stand_ins import runs_here
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.slicing import cutting
@@ -340,17 +338,6 @@ def test_neighbours_are_the_nearest_of_their_batch():
         nearest = away.sort()
         assert rows[query].tolist() == (nearest.indices[:4] + own.start).tolist()
         torch.testing.assert_close(squares[query], nearest.values[:4], rtol=1e-5, atol=1e-7)
-
-
-@pytest.mark.parametrize("compiler", [None, "/usr/local/cuda"])
-@pytest.mark.parametrize("gpu", [False, True])
-def test_the_hosts_own_rasterizer_stays_where_it_can_be_compiled(mini, monkeypatch, compiler, gpu):
-    monkeypatch.setattr("torch.utils.cpp_extension.CUDA_HOME", compiler)
-    monkeypatch.setattr("torch.cuda.is_available", lambda: gpu)
-    dialect = RT4DGS().dialect(HostRepo(mini))
-    assert runs_here(dialect, "gaussian_renderer") == bool(compiler and gpu)
-    assert runs_here(dialect, "torch")
-    assert not runs_here(dialect, "pointops2_cuda")
 
 
 def test_a_ply_is_no_model_of_this_host(tmp_path):

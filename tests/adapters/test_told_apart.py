@@ -6,10 +6,12 @@ from miniatures.mcmc import MCMCHost
 from miniatures.mini_splatting import MiniSplattingHost
 from miniatures.mip_splatting import MipHost
 from miniatures.rain_gs import RainHost
+from miniatures.rt_4dgs import RT4DGSHost
 from miniatures.runs import edit, written
 from miniatures.surfels import SurfelHost
 
 from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.injection.stand_ins import runs_here
 from fragprune_plugins.testing.conformance import found_adapter
 
 RENDERER = "gaussian_renderer/__init__.py"
@@ -49,3 +51,23 @@ def test_a_missing_script_is_named(adapter, host, script, tmp_path):
     (written(host, tmp_path) / script).unlink()
     match = found_adapter(adapter).match(HostRepo(tmp_path))
     assert f"no {script}" in [each.found for each in match.findings if each.level == "error"]
+
+
+@pytest.mark.parametrize("compiler", [None, "/usr/local/cuda"])
+@pytest.mark.parametrize("gpu", [False, True])
+@pytest.mark.parametrize(
+    ("adapter", "host", "own", "answered"),
+    [
+        ("rain-gs", RainHost, "submodules", "simple_knn"),
+        ("rt-4dgs", RT4DGSHost, "gaussian_renderer", "pointops2_cuda"),
+    ],
+)
+def test_a_rasterizer_of_its_own_stays_where_it_can_be_compiled(
+    adapter, host, own, answered, tmp_path, monkeypatch, compiler, gpu
+):
+    monkeypatch.setattr("torch.utils.cpp_extension.CUDA_HOME", compiler)
+    monkeypatch.setattr("torch.cuda.is_available", lambda: gpu)
+    dialect = found_adapter(adapter).dialect(HostRepo(written(host, tmp_path)))
+    assert runs_here(dialect, own) == bool(compiler and gpu)
+    assert runs_here(dialect, "torch")
+    assert not runs_here(dialect, answered)

@@ -4,14 +4,21 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
+from fragprune_plugins import rasterize
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.injection.launch import RunOptions
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.testing import Host
+from fragprune_plugins.workbench.commands.options import EngineOptions
+from fragprune_plugins.workbench.figures.evaluate import Candidate
+from fragprune_plugins.workbench.run.work import measure_models, photographs_of
+from fragprune_plugins.workbench.scenes.dataset import load_dataset
 
 TINY = [
     *("-r", "1", "--sh_degree", "1", "--eval"),
@@ -79,6 +86,23 @@ def check_stage_two(
     assert len(store) == info.rows == summary.gaussians == len(read(after).opacity)
     assert (info.adapter, store.steps, store.neutral) == (adapter, iterations, False)
     assert summary.fragments_after < summary.fragments_before
+
+
+def check_measured(
+    summary: Any, picture: Path, photographs: Path, read: Callable[[Path], Any] = read_ply
+) -> None:
+    """The picture of the one held-out view that a host's script rendered is what we measure."""
+    values = sidecar.load(summary.model_after)[0].values.detach()
+    candidate = Candidate(read(summary.model_after), summary.drawing)
+    (shot,) = load_dataset(photographs).test
+    with torch.no_grad():
+        image = rasterize(candidate.inputs(shot.view, candidate.model.splats()), values).image
+    pixels = (image.clamp(0, 1) * 255 + 0.5).byte().permute(1, 2, 0).numpy()
+    theirs = np.asarray(Image.open(picture))
+    assert np.abs(pixels.astype(int) - theirs).max() <= 1  # a camera's float32, rounded
+    assert (pixels != theirs).mean() < 0.05
+    before, after = measure_models(photographs_of(summary), EngineOptions())
+    assert after["fragments_per_pixel"] < before["fragments_per_pixel"]
 
 
 def edit(file: Path, old: str, new: str) -> None:

@@ -15,10 +15,10 @@ from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.testing import host as kit
 from fragprune_plugins.testing.host import MINIATURE as HOST
-from fragprune_plugins.testing.host import Running, imported
+from fragprune_plugins.testing.host import Running, expect_ancestors, imported, label
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
-__all__ = ["HOST", "Running", "imported"]  # as the kit has them
+__all__ = ["HOST", "Running", "expect_ancestors", "imported", "label"]  # as the kit has them
 
 
 class Notes:
@@ -84,16 +84,6 @@ def run_script(words: list[str], session: Session, *, activated: bool) -> None:
 def identity(model: Any) -> torch.Tensor:
     """(N,) the number each row carries in its red coefficient, which hosts copy to children."""
     return kit.Host().marks(model)
-
-
-def label(host: Running, model: Any) -> None:
-    """Give row i the identity i, and a threshold and moments that only i has."""
-    kit.label(host, model)
-
-
-def expect_ancestors(host: Running, model: Any) -> None:
-    """Every row has the threshold of the row it descends from, and its moments or none."""
-    kit.expect_ancestors(host, model)
 
 
 def tensors(model: Any) -> dict[str, torch.Tensor]:
