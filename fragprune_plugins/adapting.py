@@ -2,8 +2,7 @@
 
 a host      HostAdapter, or ScriptAdapter where it has training scripts; HostInfo, HostRepo,
             ParamGroup and those of 3DGS (GROUPS), Finding
-its source  nodes, imported, is_off, off_by_default, parameter_defaults of what HostRepo reads;
-            Plain, change_of
+its source  nodes, imported, is_off, off_by_default of what HostRepo reads; Plain, change_of
 its seams   Seam, Role, SeamCall, RowTrace, revised
 drawing     Dialect, HostCall; RasterInputs and its parts, RasterOutputs
 a proof     Prover, Proof, Place
@@ -61,7 +60,6 @@ from fragprune_plugins.hosts.source import (
     is_off,
     nodes,
     off_by_default,
-    parameter_defaults,
 )
 from fragprune_plugins.learning.goals import parse_goal
 from fragprune_plugins.plugins.hookspecs import hookimpl
@@ -130,7 +128,6 @@ __all__ = [
     "is_off",
     "nodes",
     "off_by_default",
-    "parameter_defaults",
     "parse_goal",
     "read_ply",
     "replacing",

@@ -508,8 +508,9 @@ def read_getters(fork: Fork) -> list[Finding]:
 
 def _read_draws(fork: Fork) -> None:
     """The drawing functions that a script names, and their calls."""
-    named = {name for tree in fork.trees.values() for name in _reached(fork, tree)}
     functions = graphdeco.drawing_functions(fork.repo, RENDERER)
+    drawing = [each for each in fork.trees.values() if not _mentioned(each).isdisjoint(functions)]
+    named = {name for tree in drawing for name in _reached(fork, tree)}
     while True:
         reached = [name for name in functions if name in named]
         bodies = [fork.repo.function(RENDERER, name) for name in reached]

@@ -22,7 +22,6 @@ from fragprune_plugins.adapting import (
     is_off,
     nodes,
     off_by_default,
-    parameter_defaults,
 )
 
 _DEEPEST = 3
@@ -196,7 +195,7 @@ def _of_saving(repo: HostRepo, module: str, name: str) -> Iterator[str]:
 
 
 def _activates(getter: Function, stored: str) -> bool:
-    """Whether a getter returns a function of an attribute, or the attribute, in one branch."""
+    """Whether a getter returns a function of an attribute, or the attribute, in the end."""
     known: dict[str, bool] = {}
 
     def reads(value: ast.expr | None) -> bool:
@@ -215,7 +214,8 @@ def _activates(getter: Function, stored: str) -> bool:
                 known[name] = reads(node.value) or (
                     node is not statement and known.get(name, False)
                 )
-    return any(reads(node.value) for node in nodes(getter) if isinstance(node, ast.Return))
+    returned = [node for node in nodes(getter) if isinstance(node, ast.Return)]
+    return reads(max(returned, key=lambda each: each.lineno).value) if returned else False
 
 
 def _of_positions(repo: HostRepo, module: str, name: str) -> Iterator[str]:
@@ -261,14 +261,19 @@ def _renderers(repo: HostRepo) -> list[str]:
 
 
 def _of_drawing(repo: HostRepo) -> Iterator[tuple[str, bool]]:
-    """Inputs of the rasterizer that are not the model's own, and whether they only move it."""
+    """Inputs of the rasterizer that are not the model's own, and whether they only move it.
+
+    Of several drawing functions the first counts that a training script names, or ``render``.
+    """
+    scripts = [each.stem for each in repo.root.glob("*train*.py") if each.stem.isidentifier()]
     for module in _renderers(repo):
         functions = [
             node
             for node in getattr(repo.tree(module), "body", ())
             if isinstance(node, ast.FunctionDef) and _call(node)
         ]
-        functions.sort(key=lambda each: each.name != "render")
+        named = repo.mentions(scripts, [each.name for each in functions])
+        functions.sort(key=lambda each: (each.name not in named, each.name != "render"))
         if functions:
             yield from _Drawing(repo, module, functions[0]).reasons()
             return
@@ -305,10 +310,9 @@ class _Drawing:
         arguments = function.args
         every = [*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs]
         self.parameters, self.off = {each.arg for each in every}, off_by_default(function)
+        given = zip(reversed(arguments.args), reversed(arguments.defaults), strict=False)
         self.switches = {
-            name
-            for name, value in parameter_defaults(function)
-            if isinstance(value, ast.Constant) and isinstance(value.value, bool)
+            each.arg for each, v in given if isinstance(getattr(v, "value", None), bool)
         }
         self.values: dict[str, list[ast.expr]] = {}
         self._collect(function.body)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from fragprune_plugins.errors import UnknownHostError
 from fragprune_plugins.hosts.adapter import HostAdapter, ScriptAdapter
@@ -78,20 +77,19 @@ def attempt(repo: HostRepo, adapters: Sequence[HostAdapter]) -> list[Tried]:
 
 
 def locate(
-    folder: Path,
+    repo: HostRepo,
     adapters: Sequence[HostAdapter],
     name: str | None = None,
     select: Callable[..., str | None] | None = None,
     *,
     above: bool = True,
 ) -> tuple[HostRepo, HostAdapter]:
-    """Find the checkout that contains a script's folder, and its adapter; see ``choose``.
+    """Find the checkout that is a script's folder or contains it, and its adapter; see ``choose``.
 
-    If the folder is no host, but its scripts import an installed host, or ``name`` is the adapter
+    If it is no host, but its scripts import an installed host, or ``name`` is the adapter
     of an installed host, the result is the installed package. With ``above`` the folder that
     contains this one is looked at, too.
     """
-    repo = HostRepo(folder)
     try:
         return repo, choose(repo, adapters, name, select)
     except UnknownHostError:
@@ -106,7 +104,7 @@ def locate(
             )
         ]
         packages = [package for each in used if (package := HostRepo.installed(each))]
-        outer = [HostRepo(folder.resolve().parent)] if above else []
+        outer = [HostRepo(repo.root.parent)] if above else []
         for candidate in (*outer, *packages):
             with contextlib.suppress(UnknownHostError):
                 return candidate, choose(candidate, adapters, name, select)

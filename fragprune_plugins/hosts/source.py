@@ -69,17 +69,12 @@ def imported(tree: ast.Module | None) -> list[str]:
     return list(names)
 
 
-def parameter_defaults(function: Function) -> list[tuple[str, ast.expr | None]]:
-    """The parameters that have a default, with it; None for one that must be given by name."""
+def off_by_default(function: Function) -> set[str]:
+    """Parameters that are None or False by default."""
     a = function.args
     named = [*a.posonlyargs, *a.args][-len(a.defaults) :] if a.defaults else []
     pairs = zip([*named, *a.kwonlyargs], [*a.defaults, *a.kw_defaults], strict=True)
-    return [(each.arg, value) for each, value in pairs]
-
-
-def off_by_default(function: Function) -> set[str]:
-    """Parameters that are None or False by default."""
-    return {name for name, value in parameter_defaults(function) if is_off(value)}
+    return {each.arg for each, value in pairs if is_off(value)}
 
 
 def is_off(value: ast.expr | None) -> bool:

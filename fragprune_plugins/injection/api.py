@@ -11,6 +11,7 @@ from typing import Literal
 
 from fragprune_plugins.hosts.choosing import locate
 from fragprune_plugins.hosts.findings import Finding
+from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import session as _session
 from fragprune_plugins.injection.session import Session
 from fragprune_plugins.learning.schedule import JointSchedule, Settings
@@ -48,7 +49,7 @@ def activate(
     joint = stage == "joint"
     folder = Path(host) if host is not None else Path(sys.argv[0]).resolve().parent
     tie = partial(select_adapter, plugins=plugins)
-    repo, chosen = locate(folder, plugins.adapters, adapter, select=tie)
+    repo, chosen = locate(HostRepo(folder), plugins.adapters, adapter, select=tie)
     return Session(
         chosen,
         repo,

@@ -95,7 +95,7 @@ def _host(
     package = HostRepo.installed(top) if module else None
     if package is not None and script.is_relative_to(package.root / top):
         return package, choose(package, plugins.adapters, name, select=select)
-    return locate(script.parent, plugins.adapters, name, select=select)
+    return locate(HostRepo(script.parent), plugins.adapters, name, select=select)
 
 
 def _expect_engine(

@@ -30,11 +30,11 @@ mini, of = miniature(MiniSplattingHost, MiniSplatting)
 
 def test_a_scripts_folder_lies_in_its_host(mini):
     adapters = load_plugins().adapters
-    repo, adapter = locate(mini / "ms", adapters)
+    repo, adapter = locate(HostRepo(mini / "ms"), adapters)
     assert (repo.root, adapter.name) == (mini.resolve(), "mini-splatting")
     assert choose(HostRepo(HOST), adapters).name == "vanilla-3dgs"
     with pytest.raises(UnknownHostError, match="no adapter fits"):
-        locate(mini / "nowhere" / "deep", adapters)
+        locate(HostRepo(mini / "nowhere" / "deep"), adapters)
 
 
 # -- scores --------------------------------------------------------------------------------------

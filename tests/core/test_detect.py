@@ -289,8 +289,8 @@ def test_a_script_that_imports_an_installed_host_is_its_script(
     (scripts / "mine.py").write_text(code)
     adapters = [Vanilla3DGS(), Installed()]
     if found:
-        repo, adapter = locate(scripts, adapters, name)
+        repo, adapter = locate(HostRepo(scripts), adapters, name)
         assert (repo.root, adapter.name) == (package.parent, "toy-host")
     else:
         with pytest.raises(UnknownHostError):
-            locate(scripts, adapters, name)
+            locate(HostRepo(scripts), adapters, name)

@@ -215,9 +215,9 @@ def test_a_folder_of_the_same_name_as_an_installed_host_is_not_that_host(tmp_pat
     looked_at = []
     monkeypatch.setattr(HostRepo, "installed", lambda name: looked_at.append(name))
     with pytest.raises(UnknownHostError):
-        locate(checkout, [Installed()], above=False)
+        locate(HostRepo(checkout), [Installed()], above=False)
     assert not looked_at
     (checkout / "sharedname").rmdir()
     with pytest.raises(UnknownHostError):
-        locate(checkout, [Installed()], above=False)
+        locate(HostRepo(checkout), [Installed()], above=False)
     assert looked_at == ["sharedname"]

@@ -227,10 +227,11 @@ def _repository(host: Path, adapters: list[HostAdapter], name: str | None) -> Ho
     package = None if host.is_dir() else HostRepo.installed(str(host))
     if package is not None:
         return package
+    repo = HostRepo(host)  # read once, also by the table
     try:
-        return locate(host, adapters, name, above=False)[0]
+        return locate(repo, adapters, name, above=False)[0]
     except UnknownHostError:
-        return HostRepo(host)
+        return repo
 
 
 def _conclusion(repo: HostRepo, fitting: list[Tried]) -> str:
