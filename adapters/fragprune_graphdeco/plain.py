@@ -10,6 +10,7 @@ import ast
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from weakref import WeakKeyDictionary
 
 from fragprune_graphdeco.call import RASTERIZER
 from fragprune_graphdeco.kernels import SPLAT, read_kernels
@@ -62,11 +63,20 @@ def read_models(repo: HostRepo) -> list[Plain]:
     ]
 
 
+_known: WeakKeyDictionary[HostRepo, Plain] = WeakKeyDictionary()
+
+
 def read_plain(repo: HostRepo) -> Plain:
-    """Read a checkout's model, its save function, its drawing function and its kernel."""
+    """Read a checkout's model, its save function, its drawing function and its kernel, once."""
+    if repo not in _known:
+        _known[repo] = _read_plain(repo)
+    return _known[repo]
+
+
+def _read_plain(repo: HostRepo) -> Plain:
     module, name = next(_models(repo), ("", ""))
     if not module:
-        return Plain((_without(repo),))
+        return Plain((*(each for each, _ in _of_drawing(repo)), _without(repo)))
     flat = list(_flat(repo, module, name))
     moving = dict(_of_drawing(repo))
     drawn = list(moving)
@@ -101,7 +111,8 @@ def _without(repo: HostRepo) -> str:
 def _models(repo: HostRepo) -> Iterator[tuple[str, str]]:
     """Module and class of each model in ``scene`` that saves a PLY, ``gaussian_model`` first."""
     files = sorted(each.stem for each in (repo.root / "scene").glob("*.py"))
-    files.sort(key=lambda stem: (stem != "gaussian_model", "gaussian" not in stem, len(stem)))
+    order = ("gaussian", "model")
+    files.sort(key=lambda stem: (*(word not in stem for word in order), len(stem)))
     for stem in files:
         tree = repo.tree(f"scene.{stem}") if stem.isidentifier() else None
         classes = [each for each in (tree.body if tree else ()) if isinstance(each, ast.ClassDef)]
@@ -235,11 +246,13 @@ def _of_positions(repo: HostRepo, module: str, name: str) -> Iterator[str]:
 
 def _of_scripts(repo: HostRepo) -> Iterator[str]:
     """A renderer that is not there, and scripts of which none saves a PLY."""
+    scripts, others = sorted(repo.root.glob("*.py")), sorted(repo.root.glob("*/*.py"))
+    files = {each: repo.read(each) for each in (*scripts, *others) if each.parent.name != "scene"}
     if repo.path("gaussian_renderer") is None:
-        yield "what draws its PLY is not in the checkout: no gaussian_renderer"
-    scripts = sorted(repo.root.glob("*.py"))
-    others = (each for each in sorted(repo.root.glob("*/*.py")) if each.parent.name != "scene")
-    if scripts and not any(_SAVES.search(repo.read(each)) for each in (*scripts, *others)):
+        found = (each for each, text in files.items() if RASTERIZER in text)
+        other = next((f", but {each.relative_to(repo.root)}" for each in found), "")
+        yield f"what draws its PLY was not read: there is no gaussian_renderer{other}"
+    if scripts and not any(map(_SAVES.search, files.values())):
         yield "none of its scripts saves a PLY"
 
 
@@ -263,7 +276,7 @@ def _renderers(repo: HostRepo) -> list[str]:
 def _of_drawing(repo: HostRepo) -> Iterator[tuple[str, bool]]:
     """Inputs of the rasterizer that are not the model's own, and whether they only move it.
 
-    Of several drawing functions the first counts that a training script names, or ``render``.
+    Those of ``render``, and of a relative by which training scripts draw in its place.
     """
     scripts = [each.stem for each in repo.root.glob("*train*.py") if each.stem.isidentifier()]
     for module in _renderers(repo):
@@ -272,10 +285,13 @@ def _of_drawing(repo: HostRepo) -> Iterator[tuple[str, bool]]:
             for node in getattr(repo.tree(module), "body", ())
             if isinstance(node, ast.FunctionDef) and _call(node)
         ]
+        functions.sort(key=lambda each: each.name != "render")
         named = repo.mentions(scripts, [each.name for each in functions])
-        functions.sort(key=lambda each: (each.name not in named, each.name != "render"))
+        others = [each for each in functions[1:] if each.name.startswith("render")]
+        instead = [each for each in others if each.name in named and "render" not in named]
+        for function in [*functions[:1], *instead[:1]]:
+            yield from _Drawing(repo, module, function).reasons()
         if functions:
-            yield from _Drawing(repo, module, functions[0]).reasons()
             return
 
 

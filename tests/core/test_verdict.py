@@ -130,6 +130,11 @@ def test_the_nearest_host_is_of_this_family(fork):
             "self.scaling_activation(self._scaling) + self.least",
             "get_scaling is computed",
         ),
+        (
+            "return self.scaling_activation(self._scaling)",
+            "if self.still: return self._scaling\n        return self.net(self._scaling) * 2",
+            "get_scaling is computed",
+        ),
         ("{'params': [], 'name': 'f_dc'}", "{'params': [self._opacity]}", "not train positions"),
         ("shs=shs, scales", "colors_precomp=torch.exp(rgb), shs=shs, scales", "torch.exp(rgb)"),
         ("shs=shs, scales", "colors_precomp=pc.net(view), shs=shs, scales", "colours from pc.net"),
@@ -163,8 +168,20 @@ def test_what_is_never_saved_or_drawn_is_not_plain(fork, tmp_path):
     script = tmp_path / "train.py"
     script.write_text(script.read_text().replace("scene.save(", "scene.show("))
     assert "none of its scripts saves a PLY" in read_plain(repo).reasons
-    (tmp_path / "gaussian_renderer/__init__.py").unlink()
-    assert "no gaussian_renderer" in read_plain(HostRepo(tmp_path)).reasons[0]
+    renderer = tmp_path / "gaussian_renderer/__init__.py"
+    renderer.rename(tmp_path / "drawing.py")
+    found = read_plain(HostRepo(tmp_path)).reasons[0]
+    assert found.endswith("there is no gaussian_renderer, but drawing.py")
+
+
+def test_the_drawing_that_a_training_script_names_decides(fork, tmp_path):
+    fork()
+    renderer, script = tmp_path / "gaussian_renderer/__init__.py", tmp_path / "train.py"
+    drawn = RENDER.replace("def render(", "def render_all(").replace("pc.get_xyz", "pc.net(t)")
+    renderer.write_text(RENDER + drawn)
+    assert read_plain(HostRepo(tmp_path))
+    script.write_text(script.read_text().replace("import render\n", "import render_all\n"))
+    assert "render_all makes means3D from pc.net" in read_plain(HostRepo(tmp_path)).reasons[0]
 
 
 def test_of_several_folders_one_with_a_plain_ply_decides(fork, tmp_path):
@@ -181,6 +198,8 @@ def test_a_model_that_is_not_in_the_checkout_is_looked_for_in_its_submodules(tmp
     model = "class GaussianModel:\n    def __init__(self, sh_degree): ...\n"
     (tmp_path / "scene/gaussian_model.py").write_text(model)
     assert "GaussianModel has no save_ply" in judged(HostRepo(tmp_path)).reason
+    (tmp_path / "gaussian_renderer.py").write_text(RENDER.replace("pc.get_xyz", "pc.net(t)"))
+    assert "means3D from pc.net" in judged(HostRepo(tmp_path)).reason
 
 
 def test_a_model_in_another_module_is_named(fork, tmp_path):
