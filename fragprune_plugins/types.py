@@ -64,7 +64,6 @@ def check_tensor(name: str, tensor: Tensor | None, *shape: int | None, whole: bo
     """Raise InputError unless tensor is None or holds real numbers in the shape.
 
     Args:
-        name: of the tensor.
         tensor: the value to check; only a dense tensor with its data in memory passes.
         shape: lengths; None stands for any.
         whole: require an integer type instead of a floating one.

@@ -155,7 +155,6 @@ def fragments(
         footprints: K of them.
         pixels: (P, 2) x, y.
         thresholds: (K,) or None.
-        options: the cuts.
     """
     dx, dy = offsets(footprints, pixels)
     q, depth = squared_distances(footprints.conic, dx, dy), None

@@ -198,7 +198,6 @@ def collect(
     """Assemble the whole image from its blocks.
 
     Args:
-        camera: its size and background.
         front: (K,) rows of the N Gaussians that the footprints stand for.
         radii: (N,) int32 pixels.
         blocks: row by row.
@@ -254,7 +253,6 @@ def cut(
     """Cut the image into tiles, row by row, or take all of it as one block.
 
     Args:
-        camera: its size.
         footprints: K of them.
         rects: (K, 4) tiles of each.
         drawable: (K,) bool.
@@ -285,10 +283,8 @@ def draw(
     """Blend a block's footprints, front to back, at each of its pixels.
 
     Args:
-        footprints: all K footprints.
         thresholds: (K,) or None.
         block: the pixels and the rows of its footprints.
-        options: the cuts.
     """
     here = footprints.take(block.rows)
     tau = None if thresholds is None else thresholds[block.rows]

@@ -63,11 +63,7 @@ def tell_once(what: str) -> None:
 
 
 class Unread:
-    """In place of a value that the host was seen not to read.
-
-    Args:
-        name: of the value.
-    """
+    """In place of a value that the host was seen not to read."""
 
     unread = True
     """A proof may let the value be, whatever it is."""

@@ -533,7 +533,6 @@ def resolution(repo: HostRepo, asked: int | None) -> Resolution:
     """The resolution for the host's ``-r``: a divisor, at most 1,600 pixels, or a width.
 
     Args:
-        repo: the checkout, whose source says which numbers are divisors.
         asked: the flag's value; None if the command lacks it.
 
     Raises:

@@ -18,8 +18,6 @@ def needy(arguments: Mapping[str, Any], rows: int, flat: Callable[..., Tensor]) 
     """(rows,) bool: rows whose screen gradient makes a densify method add Gaussians.
 
     Args:
-        arguments: the method's.
-        rows: number of rows of the model now.
         flat: (n, 1) -> (n,), the method's own reduction, so that rounding agrees at the threshold.
     """
     return reaches(flat(arguments["grads"], dim=-1), arguments["grad_threshold"], rows)
@@ -43,13 +41,7 @@ def clones(call: SeamCall, needy: Needy = needy) -> Tensor:
 
 
 def splits(call: SeamCall, needy: Needy = needy, copies: int | None = None) -> Tensor:
-    """Rows (n,) that densify_and_split copies N times: large Gaussians with a large gradient.
-
-    Args:
-        call: of the method.
-        needy: selects the rows with a large gradient.
-        copies: replaces N.
-    """
+    """Rows (n,) that densify_and_split copies N times: large Gaussians with a large gradient."""
     import torch
 
     size, limit = _sizes(call)

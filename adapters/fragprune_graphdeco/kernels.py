@@ -59,7 +59,6 @@ def read_kernels(repo: HostRepo, package: str, kernel: Kernel) -> list[Finding]:
     """Compare the sources of a rasterizer that a checkout vendors with a known rule.
 
     Args:
-        repo: the checkout.
         package: import name of the rasterizer.
         kernel: the rule that the adapter's engines draw by.
 

@@ -52,8 +52,6 @@ def gradient_differences(
 
     Args:
         found: gradients by name, one row per Gaussian; None for zero.
-        expected: the right ones.
-        leaves: the tensors themselves.
     """
     for name, leaf in leaves.items():
         rows = [
@@ -263,7 +261,6 @@ def chart(arguments: Mapping[str, Tensor], view: View) -> dict[str, Tensor]:
 
     Args:
         arguments: the host's, one row per Gaussian.
-        view: the camera.
     """
     random, like = torch.Generator().manual_seed(7), arguments["means3D"]
     count = max(160, view.width * view.height // 48)

@@ -40,10 +40,8 @@ def rasterizer(
     """The rasterizer package: settings, rasterizer and, for late revisions, the sparse Adam.
 
     Args:
-        package: its import name.
         settings: field names of the settings tuple, in order.
         sparse_adam: whether to offer SparseGaussianAdam.
-        draw: answers a call with bound arguments.
         also: further methods of the rasterizer, called like ``forward``.
     """
     fields = [(name, Any) for name in settings]
@@ -175,7 +173,6 @@ class SparseGaussianAdam(torch.optim.Adam):
 
     Args:
         params: param groups of one parameter each, every parameter with N rows.
-        lr: learning rate.
         eps: added to the root of the second moment.
     """
 
@@ -188,7 +185,6 @@ class SparseGaussianAdam(torch.optim.Adam):
 
         Args:
             visibility: (N,) bool.
-            N: number of Gaussians.
         """
         rows = visibility.nonzero()[:, 0]
         for group in self.param_groups:

@@ -101,9 +101,6 @@ def project(
         opacities: (N,) activated.
         viewmat: (4, 4) world to camera, acting on column vectors.
         K: (3, 3) intrinsics.
-        width: pixels.
-        height: pixels.
-        rules: the settings of this call.
     """
     rotation = viewmat[:3, :3]
     seen = means @ rotation.T + viewmat[:3, 3]

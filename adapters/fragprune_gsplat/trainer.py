@@ -87,11 +87,7 @@ class TrainerDialect(GsplatDialect):
 
 
 class SimpleTrainer(Gsplat, ScriptAdapter):
-    """The adapter of a copy of the script, with the installed gsplat.
-
-    Args:
-        script: the file.
-    """
+    """The adapter of a copy of the script, with the installed gsplat."""
 
     seams = (
         *Gsplat.seams,

@@ -42,7 +42,6 @@ def render_depth(
 
     Args:
         inputs: of one view, with scores.
-        draw: rasterizes.
 
     Returns:
         ``render`` (3, H, W), ``out_pts`` (3, H, W) world, ``rendered_depth``, ``discriminants`` and

@@ -34,13 +34,9 @@ def rewritten(
 
     Args:
         method: the name of our method.
-        arguments: of ns-train.
-        settings: of stage 2.
         stage: "auto" for stage 2 after the training, "finetune" for stage 2 alone, of a checkpoint
             or from ``from_iter`` on.
-        from_iter: iteration at which stage 2 begins.
         engine: that draws with thresholds.
-        device: "cpu", "cuda" or "cuda:N".
 
     Raises:
         UsageError: the arguments ask for another method, or for what ns-train cannot do.

@@ -56,7 +56,6 @@ def rows_among(known: Mapping[str, Tensor], chosen: Mapping[str, Tensor], where:
     Args:
         known: (N, C) values of the model, by name.
         chosen: (M, C) values under the same names.
-        where: for messages.
 
     Raises:
         AlignmentError: it is no such selection.

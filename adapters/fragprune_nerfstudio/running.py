@@ -55,14 +55,9 @@ def run(
     """Run the method that has stage 2 in it.
 
     Args:
-        name: the adapter's.
-        repo: the host's package.
         rewritten: gives the method's arguments for those of the command; see ``command.rewritten``.
         evaluation: the command that measures held-out views, as text for people.
-        script: the host's training script.
-        arguments: of the command.
         module: the module's name in ``python -m module``; "" for a script.
-        options: of the run.
 
     Raises:
         UsageError: the method cannot do what the command or the options ask for.

@@ -29,7 +29,6 @@ def native_arrays(
     Args:
         inputs: the rasterization; the values of ``means2d_hook`` are not used.
         thresholds: (N,) or None, already checked by ``inputs.check_thresholds``.
-        where: the device that will read the arrays.
     """
     given = vars(inputs.view) | vars(inputs.splats) | vars(inputs) | {"thresholds": thresholds}
     return {
@@ -53,8 +52,6 @@ def native_inputs(
         inputs: the rasterization. ``counts`` and ``scores`` are ignored: they choose outputs.
         arrays: the result of ``native_arrays``.
         widen: thresholds will want a gradient.
-        threads: number of threads, for the cpu engine.
-        workspace: address of the workspace, for the cpu engine.
     """
     view, splats = inputs.view, inputs.splats
     return binding.Inputs(

@@ -117,7 +117,6 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
     If anything fails inside, ``path`` stays as it was.
 
     Args:
-        path: the file.
         durable: after the block it also survives a power cut, which takes some milliseconds more.
 
     Raises:

@@ -70,7 +70,6 @@ def read_ply(path: Path, *, filtered: bool = False) -> Model:
     """Read a trained splat. The number of f_rest columns gives the SH degree.
 
     Args:
-        path: the file.
         filtered: accept a model that the caller draws by its host's rules: one with a 3D filter
             (Mip-Splatting), or of surfels, which have two scales (2D Gaussian Splatting).
 

@@ -106,8 +106,6 @@ def save(model: Path, store: ThresholdStore, **about: Any) -> Path:
     """Write the store beside an existing model file, which stays; returns the sidecar's path.
 
     Args:
-        model: the file.
-        store: its thresholds.
         about: adapter, host_commit and settings, as ``SidecarInfo`` has them.
 
     Raises:
@@ -129,7 +127,6 @@ def replace_pair(path: Path, whole: Path, store: ThresholdStore | None, **about:
     A process that ends in between, or a power cut, leaves the old pair or the new one.
 
     Args:
-        path: of the model.
         whole: the finished file, in a folder that ``atomic.staging`` gave for ``path``.
         store: its thresholds; None for a model without a sidecar.
         about: as in ``save``.
@@ -205,10 +202,8 @@ def load(
     """Read the sidecar of a model file.
 
     Args:
-        model: the file.
         rows: of the model, from whoever has it; others are refused. None takes as many as the
             sidecar says that it has.
-        device: where the store is to live.
 
     Raises:
         SidecarError: missing, unreadable, not finite, written for another model file, or of other

@@ -30,10 +30,6 @@ def optimizer_state(capture: Any, where: str) -> dict[str, Any]:
 
     It can hold a key of ours, because ``load_state_dict`` ignores keys that it does not know.
 
-    Args:
-        capture: what the host's ``capture`` returned.
-        where: for the message.
-
     Raises:
         ModelFileError: there is none.
     """
@@ -248,7 +244,6 @@ class CommandLine:
         """Numbers of other flags, by name, as the host will read them.
 
         Args:
-            arguments: of the host's command.
             defaults: by a flag's name without dashes, the host's default.
 
         Raises:
@@ -338,7 +333,6 @@ class HostAdapter(ABC):
         arguments, the module's name and the ``RunOptions``, and returns a ``RunSummary``.
 
         Args:
-            repo: the host.
             script: the file, which may be outside the host and import it.
         """
         return None
@@ -379,7 +373,6 @@ class HostAdapter(ABC):
         """Restore state that the host's own resume loses.
 
         Args:
-            model: the host's model.
             output: the folder of the run that was resumed; None if stage 2 resumes none.
         """
 
@@ -403,8 +396,6 @@ class ScriptAdapter(HostAdapter):
         """Refuse, before stage 1, arguments of a training that stage 2 cannot follow.
 
         Args:
-            repo: the host.
-            arguments: of its command.
             stage: "auto", "finetune" or "joint".
             device: "cpu", "cuda" or "cuda:N".
 
@@ -416,7 +407,6 @@ class ScriptAdapter(HostAdapter):
         """Arguments of a host that cannot resume (``CommandLine.one_run``) for a longer training.
 
         Args:
-            arguments: of the command.
             first: the iteration at which its training would end, and at which it also saves.
             last: the iteration at which stage 2 ends.
         """

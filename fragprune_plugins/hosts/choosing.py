@@ -122,9 +122,6 @@ def choose(
     If the adapters of a host and of its ancestor both fit, the host's is chosen (``closest``).
 
     Args:
-        repo: the checkout.
-        adapters: to choose from.
-        name: of the adapter that the user named.
         select: breaks a tie; the hook ``fragprune_select_adapter``.
 
     Raises:
@@ -173,12 +170,7 @@ def _nearest(tried: Sequence[Tried]) -> str:
 
 
 def closest(tried: Sequence[Tried], adapters: Sequence[HostAdapter]) -> list[Tried]:
-    """The adapters that fit, without those that are ancestors of another one.
-
-    Args:
-        tried: results of adapters on a checkout.
-        adapters: all adapters, to find ancestors of ancestors.
-    """
+    """The adapters that fit, without those that are ancestors of another one."""
     fitting = [each for each in tried if each.match.fits]
     parents = {adapter.name: adapter.descends_from for adapter in adapters}
     ancestors: set[str] = set()

@@ -105,9 +105,7 @@ class Prover(ABC):
         """Draw a call both ways and compare every output and every gradient.
 
         Args:
-            call: at the seam.
             drawn: the same as data, with the engine.
-            place: where the host calls.
         """
 
     @abstractmethod
@@ -162,7 +160,6 @@ class Dialect(ABC):
         """Draw, and translate outputs into what the host expects; perhaps several times.
 
         Args:
-            call: the host's call.
             inputs: the result of ``unpack``.
             draw: rasterizes inputs with the thresholds of this call. If one call has several
                 cameras, a second argument numbers them from 0.

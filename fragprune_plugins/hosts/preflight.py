@@ -59,8 +59,6 @@ def missing_imports(
     import. It ignores imports inside ``try``, a condition or a function.
 
     Args:
-        repo: the host.
-        scripts: the files to run.
         provided: dotted import names for which we have stand-ins.
     """
     found: dict[str, Missing] = {}
@@ -77,10 +75,7 @@ def expect(
     """Raise unless a script's packages and data are there; the error lists all missing ones.
 
     Args:
-        repo: the host.
-        script: the script that is about to run.
         provided: dotted import names for which we have stand-ins.
-        data: the data folder that the command names.
 
     Raises:
         HostNeedsError: something is missing.

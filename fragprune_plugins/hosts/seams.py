@@ -213,7 +213,6 @@ def revised(
     """Change an ancestor's table of seams for a descendant.
 
     Args:
-        seams: the ancestor's.
         changes: new field values of a seam, by its attribute; None removes the seam.
 
     Raises:

@@ -73,8 +73,6 @@ def are_copies(
     """Whether new rows equal their parents to the bit in every group that children copy.
 
     Args:
-        session: the state of the session.
-        model: the model that owns the parents.
         tensors: (P, ...) new rows by param group.
         parents: (P,) rows of the parents.
     """

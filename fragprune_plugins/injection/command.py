@@ -74,7 +74,6 @@ class HostCommand:
 
         Args:
             scratch: folder for a copy of the host's configuration file.
-            last: the last iteration of the run.
             extra: values by field of ``CommandLine``.
         """
         if self.line.checkpoints_only:
@@ -177,12 +176,6 @@ def _script_of(module: str) -> Path:
 
 def overrule(config: ConfigFile, path: Path, copy: Path, given: dict[str, Any]) -> None:
     """Write a copy of a configuration file with other values, and check it by reading it.
-
-    Args:
-        config: reads and writes the file's format.
-        path: the file.
-        copy: the file to write.
-        given: values by flag.
 
     Raises:
         UsageError: the copy does not hold the values.

@@ -85,10 +85,7 @@ def _host(
     """The host of a script, a checkout or an installed package, and its adapter.
 
     Args:
-        script: the file.
         module: the module's name in ``python -m module``; "" for a script.
-        name: the adapter's; None to detect it.
-        plugins: offer the adapters.
     """
     select = partial(select_adapter, plugins=plugins)
     top = module.split(".")[0]

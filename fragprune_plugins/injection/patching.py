@@ -42,7 +42,6 @@ class PatchLedger:
         """Wrap a seam now if its module is imported, else as soon as the module is imported.
 
         Args:
-            seam: the function to wrap.
             wrapper: ``wrapper(wrapped, instance, args, kwargs)``, as wrapt calls it.
 
         Raises:

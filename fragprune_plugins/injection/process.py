@@ -22,12 +22,7 @@ _OURS = Path(__file__).parents[1]
 
 @contextlib.contextmanager
 def telling(script: Path, root: Path) -> Iterator[None]:
-    """Turn an exception of the host into a ``HostFailed``; stderr gets the whole traceback.
-
-    Args:
-        script: the script that runs.
-        root: the host's folder.
-    """
+    """Turn an exception of the host into a ``HostFailed``; stderr gets the whole traceback."""
     try:
         yield
     except FragpruneError:
@@ -62,9 +57,6 @@ def host_process(
     """Inside, ``sys.argv``, ``sys.path`` and devices are set for the script; then restored.
 
     Args:
-        script: the script's file.
-        arguments: the script's arguments.
-        device: "cpu", "cuda" or "cuda:N".
         folder: the first folder of the module search path; None for the script's folder.
     """
     saved = sys.argv, sys.path[:], sys.stdout, sys.stderr
@@ -97,7 +89,6 @@ def run_main(script: Path, module: str = "") -> None:
     """Run a script as ``__main__``; returns when it ends, also by ``sys.exit(0)``.
 
     Args:
-        script: the file to run.
         module: the module's name, if the script runs as ``python -m module``.
 
     Raises:
@@ -148,10 +139,6 @@ def forget_modules(root: Path, known: set[str], packages: tuple[str, ...] = ()) 
 
 def host_device(wanted: str, engine: str) -> str:
     """The host's device, "cpu", "cuda" or "cuda:N"; "auto" takes a GPU if torch sees one.
-
-    Args:
-        wanted: the ``--device`` option.
-        engine: the ``--engine`` option.
 
     Raises:
         UsageError: the device does not exist.

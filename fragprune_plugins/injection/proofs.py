@@ -42,10 +42,6 @@ def proved(
     None where it failed and may fail, and where our engines do not draw such a call.
 
     Args:
-        session: the state of the session.
-        prover: compares the two rasterizers.
-        call: at the seam.
-        drawn: the same as data.
         strict: False warns where the proof fails.
 
     Raises:

@@ -96,10 +96,7 @@ def adopt(session: SessionState, model: Any, expected: Tensor, store: ThresholdS
     resumes it. If not, they wait for another model.
 
     Args:
-        session: the state of the session.
-        model: the model that the host draws.
         expected: (N, 3) means of the unpacked file.
-        store: the file's thresholds.
 
     Raises:
         AlignmentError: the model has other means.

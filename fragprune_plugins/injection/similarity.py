@@ -74,10 +74,6 @@ def agrees_on_a_probe(function: Callable[..., Any], shape: torch.Size) -> bool:
     """Whether a host's function gives the same value and gradient, but for rounding.
 
     The probe is two small images, from dark, where the constants count, to bright.
-
-    Args:
-        function: the host's own.
-        shape: of its images, for the dimensions before height and width.
     """
     stream, light = torch.Generator().manual_seed(0), torch.logspace(-2.5, 0, 40)
     image, target = (torch.rand(*shape[:-2], 24, 40, generator=stream) * light for _ in range(2))

@@ -267,11 +267,7 @@ class Stages:
         return stated(self.host.script.name, found, "a run that reaches its end", remedy)
 
     def summary(self, seconds: float) -> RunSummary:
-        """The summary, after all stages have ended.
-
-        Args:
-            seconds: wall time of all stages.
-        """
+        """The summary, after all stages have ended."""
         learned = self.learned
         photographs, drawing, not_compared = self._comparison()
         return RunSummary(

@@ -41,7 +41,6 @@ class StandIns:
     """The stand-ins that a dialect makes for its host's compiled packages.
 
     Args:
-        dialect: makes the stand-ins.
         draw: answers the host's rasterizer calls.
         drop_in: whether to place stand-ins; None places those whose packages cannot be imported.
     """
@@ -95,9 +94,6 @@ class StandIns:
 
     def refuse_leftovers(self, root: Path) -> None:
         """Refuse a host that was imported in an earlier session and draws with its classes.
-
-        Args:
-            root: the host's folder.
 
         Raises:
             LateImportError: a module of the host holds a class of an earlier session's stand-in.

@@ -102,9 +102,7 @@ def remember(start: Start, host: HostCommand, commit: str) -> None:
     """Mark stage 1 as finished, so that the same command need not repeat it; see ``finished``.
 
     Args:
-        start: its end.
         host: its command. Without an output folder in it there is no mark.
-        commit: the host's revision.
 
     Raises:
         OutputError: the mark cannot be written.

@@ -81,10 +81,6 @@ class SessionState:
     """The state of one host in this process, and of the models that the host trains.
 
     Args:
-        adapter: describes the host.
-        repo: the host's checkout or package.
-        plugins: loaded plugins.
-        settings: settings of the fine-tuning.
         learn: whether thresholds learn. False only applies thresholds of sidecars and checkpoints
             (``--stage off``, render scripts, the host's own stage 1).
         schedule: replaces the schedule that the plugins create.
@@ -202,13 +198,7 @@ class SessionState:
             self.last, self.last_state = weakref.ref(model), state
 
     def changed(self, store: ThresholdStore, operation: str, before: int) -> None:
-        """Tell observers that rows changed.
-
-        Args:
-            store: the store after the change.
-            operation: name of the change.
-            before: number of rows before it.
-        """
+        """Tell observers that rows changed."""
         change = PopulationChange(operation, before, len(store))
         self.plugins.tell(hookspecs.fragprune_population_changed, store=store, change=change)
 
@@ -219,8 +209,6 @@ class SessionState:
         those of a control.
 
         Args:
-            model: the model.
-            path: its file.
             whole: the file's new content, which replaces ``path`` together with the sidecar; see
                 ``sidecar.replace_pair``. None if ``path`` is written already.
 

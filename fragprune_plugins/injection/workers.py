@@ -49,12 +49,7 @@ class _WorkerSession(Session):
 
 @contextlib.contextmanager
 def prepared(session: Session, device: str) -> Iterator[None]:
-    """Inside, worker processes that the host spawns are prepared for the session's host.
-
-    Args:
-        session: the session of this process.
-        device: "cpu", "cuda" or "cuda:N".
-    """
+    """Inside, worker processes that the host spawns are prepared for the session's host."""
     original = spawn.get_preparation_data
     repo = session.repo
     ours = _Preparation(session.adapter.name, repo.root, repo.package, device)

@@ -154,10 +154,6 @@ GOALS: dict[str, type[Goal]] = {each.name: each for each in (Pressure, Fewer, Po
 def parse_goal(text: str, goals: Mapping[str, type[Goal]] = GOALS) -> Goal:
     """The goal that ``str`` made a text of.
 
-    Args:
-        text: the goal's.
-        goals: by name.
-
     Raises:
         UsageError: the name is none of a goal, or the number is missing or out of range.
     """

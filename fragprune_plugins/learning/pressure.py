@@ -145,8 +145,6 @@ class StepViews:
         """Note a view drawn with gradients: its fragments per pixel now and before learning.
 
         Args:
-            fragments: now.
-            untruncated: before.
             pressed: what the pressure acts on; the fragments when None.
         """
         pressed = fragments if pressed is None else pressed

@@ -199,7 +199,6 @@ class Schedule:
     Subclass and return an instance from ``fragprune_create_schedule`` to change it.
 
     Args:
-        settings: of the run.
         warmup: steps without truncation; ``Settings.warmup`` when None, which is none in a run of
             2,000 steps or less.
     """

@@ -108,7 +108,6 @@ class Stage2:
 
     Args:
         store: the thresholds; changed in place.
-        settings: of the fine-tuning.
         schedule: gives the plan of each step; ``Schedule(settings)`` when None.
         truncate: gives the thresholds to draw with; the hook ``fragprune_truncate``.
         views: by view, a call that draws it again and ends in ``drew``; a target is met on these.
@@ -245,7 +244,6 @@ class Stage2:
 
         Args:
             view: tells views apart.
-            outputs: of the engine.
             untruncated: draws the same without thresholds and stop, at the view's first visit.
             part: of a view whose driver draws several pictures at once.
             area: the ellipses' area per pixel (``area_per_pixel``) for the pressure to act on; the

@@ -64,7 +64,6 @@ class Target:
         """Shift all thresholds onto the target.
 
         Args:
-            store: the thresholds.
             ratio: draws the views and gives the ratio of their fragments.
             views: that calibration measures.
         """
@@ -95,7 +94,6 @@ def calibrate(
     Args:
         store: the thresholds; changed in place.
         ratio: before over after, with the store as it stands.
-        target: of the ratio.
         tolerance: relative distance at which to stop.
         rounds: most measurements.
 

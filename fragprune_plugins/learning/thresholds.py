@@ -242,7 +242,6 @@ class ThresholdStore:
         """Append rows at the end.
 
         Args:
-            count: how many.
             parents: (count,) int64, the rows whose thresholds the new ones inherit; neutral when
                 None. Moments of new rows are zero, as the hosts' are.
         """

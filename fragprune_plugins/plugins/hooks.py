@@ -33,8 +33,6 @@ def engine_for(
 
     Args:
         name: "auto", "reference", "cpu", "cuda", or a name that a plugin answers.
-        device: the device of the tensors.
-        plugins: the plugins to ask; None for those of the process.
 
     Raises:
         EngineError: the name is unknown, or the engine cannot run here.
@@ -68,7 +66,6 @@ def thresholds_for(
     """The thresholds (N,) to draw with, in falloff; None for no truncation.
 
     Args:
-        inputs: of the rasterization.
         given: a store, for which plugins are asked unless it is neutral; or thresholds to use as
             they are.
         plugins: the plugins to ask; None for those of the process.

@@ -134,9 +134,7 @@ class Plugins:
         """Ask a hook; returns the first answer that is not None, or None if no plugin answers.
 
         Args:
-            hook: the hook's name.
             wrong: returns what is wrong with an answer, or None.
-            given: the hook's arguments.
 
         Raises:
             PluginError: a plugin raised, or its answer is wrong.

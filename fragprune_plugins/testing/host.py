@@ -362,7 +362,6 @@ def imported(path: Path, packages: Sequence[str] = ()) -> Iterator[None]:
     """Put a host's folder first on the path; afterwards its modules are forgotten.
 
     Args:
-        path: the folder.
         packages: the host's packages, if the folder is that of all installed packages.
     """
     known = set(sys.modules)
@@ -398,11 +397,6 @@ def running(
     """Import the host in this process under a session, which is activated by default.
 
     Args:
-        settings: of the fine-tuning.
-        adapter: the host's adapter.
-        path: its folder.
-        driver: how to drive the host.
-        plugins: further objects with hooks to register.
         active: False leaves the session's activation to the caller.
         options: of the session; by default it uses our stand-ins.
     """

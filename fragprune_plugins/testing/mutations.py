@@ -18,8 +18,6 @@ def copy_source(repo: HostRepo, target: Path, packages: Sequence[str] = ()) -> H
     """A copy of a host's Python files, and nothing else of it.
 
     Args:
-        repo: the host.
-        target: an empty folder.
         packages: the host's packages, if its folder is that of all installed packages.
     """
     for folder in [repo.root / name for name in packages] or [repo.root]:

@@ -29,7 +29,6 @@ def rewrite(root: Path, changes: Mapping[str, Changes], added: type | None = Non
     """Change files of a host, and give its model the methods of a class.
 
     Args:
-        root: the host's folder.
         changes: passages to replace, by file relative to the folder.
         added: a class; the source of its methods is added to GaussianModel. They replace methods of
             the same names, which they can call as ``vanilla_NAME``, without underscores around it.

@@ -65,11 +65,6 @@ def compare(gpu: Device, where: torch.device, workload: Workload | None = None) 
     """Describe every difference of the cuda engine; empty if all is well.
 
     Without the cpu engine, large frames are only compared with their repetitions.
-
-    Args:
-        gpu: runs the kernels.
-        where: the device of the tensors.
-        workload: how much to draw.
     """
     workload = Workload() if workload is None else workload
     return [
@@ -198,8 +193,6 @@ def scene(count: int, size: tuple[int, int], extent: float) -> tuple[RasterInput
     the picture or behind the camera.
 
     Args:
-        count: N.
-        size: width and height, pixels.
         extent: median of the standard deviations, pixels.
     """
     generator = torch.Generator().manual_seed(count)

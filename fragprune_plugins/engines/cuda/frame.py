@@ -128,12 +128,8 @@ def unblend_macros(
     """The macros with which native/cuda/unblend.cu is compiled.
 
     Args:
-        wanted: names of the inputs that need gradients.
         sh_turns: whether colours depend on the viewing direction.
-        invdepth: whether there is a gradient by inverse depth.
         absolute: whether to fill the hook's third column.
-        offsets: whether pixels have sample offsets.
-        features: the number of channels that have a gradient.
     """
     colour = bool(wanted & {"colors", "sh"}) or ("means" in wanted and sh_turns)
     return {
@@ -175,8 +171,6 @@ class Arena:
     """Named arrays in one tensor, each at a multiple of 256 bytes.
 
     Args:
-        where: the device.
-        fill: torch.empty or torch.zeros.
         sizes: bytes, by name.
     """
 
@@ -337,7 +331,6 @@ class Drawing:
 
         Args:
             capacity: the number of list entries, over all tiles, to allocate room for.
-            wanted: names of the inputs that will need gradients.
             deterministic: give each entry its own slot, so that backward can add in order.
         """
         inputs, n, where = self._inputs, self._n, self.where
@@ -371,13 +364,7 @@ class Drawing:
         )
 
     def _room(self, capacity: int, keep: bool, slots: bool) -> Memory:
-        """The memory of a frame.
-
-        Args:
-            capacity: list entries.
-            keep: gradients will be needed.
-            slots: in a fixed order.
-        """
+        """The memory of a frame."""
         n, where = self._n, self.where
         tiles = self._across * self._down
         pixels = self._inputs.view.width * self._inputs.view.height
@@ -444,12 +431,7 @@ class Drawing:
         )
 
     def _list(self, frame: Frame, memory: Memory) -> None:
-        """Project the Gaussians, and list them by tile and depth.
-
-        Args:
-            frame: the kernels' arguments; told where the lists end up.
-            memory: of the frame.
-        """
+        """Project the Gaussians, and list them by tile and depth."""
         n, capacity, passes = self._n, frame.capacity, memory.passes
         cleared, scratch, kept = memory.cleared, memory.scratch, memory.kept
         keys = [scratch["entry_keys"], scratch["entry_keys_2"]]

@@ -162,7 +162,6 @@ def target_of(capability: int, architectures: tuple[int, ...]) -> str:
 
     Args:
         capability: of the GPU, major times ten plus minor.
-        architectures: that the toolkit knows.
 
     Raises:
         Unavailable: the GPU is too old to run the kernels.
@@ -221,9 +220,7 @@ def image_of(
 
     Args:
         source: a name in native/cuda, without .cu.
-        macros: to define.
         target: sm_90 for machine code, compute_90 for PTX.
-        by: the compiler; ``compiler()`` when None.
 
     Raises:
         Unavailable: there is no compiler, or the source does not compile.

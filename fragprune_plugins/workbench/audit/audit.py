@@ -218,10 +218,8 @@ def audit(
     Args:
         model: N Gaussians, drawn with their thresholds and stop where they have some.
         views: the cameras with their names, on the model's device.
-        engine: draws and counts.
         tiles: of all views together, whose fragments are weighed one by one.
         repeats: timed frames of each timed view and cut.
-        progress: draw a bar on stderr.
 
     Returns:
         Figures as plain values, and the views that pictures show.
@@ -243,10 +241,6 @@ def audit(
 class _Survey:
     """An audit under way.
 
-    Args:
-        model: that is audited.
-        engine: draws and counts.
-
     Attributes:
         candidates: the model and its cuts, by name.
         shown: the views that pictures show.
@@ -266,8 +260,6 @@ class _Survey:
         """Draw a view of the model and of its cuts.
 
         Args:
-            name: of the view.
-            view: the camera.
             shown: pictures show it, and frames of it are timed.
         """
         engine, splats, itself = self._engine, self._splats, None

@@ -27,10 +27,6 @@ _KINDS = ("", "_fragments", "_overdraw")
 def draw(folder: Path, shown: Sequence[Shown]) -> dict[str, Any]:
     """Write the pictures of the shown views, one pixel for each of the view's.
 
-    Args:
-        folder: for the PNGs.
-        shown: the views.
-
     Returns:
         limit: the count at the top of the scale of all maps; views: name, width, height and
         files (picture, fragments, overdraw) of each.
@@ -105,7 +101,6 @@ def compose(figures: Mapping[str, Any], folder: Path) -> str:
 
     Args:
         figures: of ``audit``, with "model", "cameras" and "maps".
-        folder: of the pictures.
     """
     cuts, viewers, idle, kinds = _tables(figures)
     return page.render(

@@ -69,7 +69,6 @@ def place(
     """Cameras all around a splat, or inside of it.
 
     Args:
-        splat: N Gaussians.
         count: cameras.
         engine: draws small pictures to choose by.
         side: where they go.

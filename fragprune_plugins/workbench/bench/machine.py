@@ -15,9 +15,6 @@ from fragprune_plugins.engines.cpu import binding
 def describe_machine(device: torch.device | str = "cpu") -> dict[str, Any]:
     """The processor, and the versions that decide about speed.
 
-    Args:
-        device: where the work is done.
-
     Returns:
         processor, cores, platform, torch, native (build of the cpu engine, or None), gpu (name of
         the device, None for the CPU).

@@ -58,10 +58,8 @@ def measure(
     On a GPU the clock stops when it is idle again, after the backward pass too.
 
     Args:
-        cases: the rasterizations to time.
         engines: the engines to time. Pictures are compared with those of the first engine.
         repeats: number of rounds after one warm-up round.
-        say: called with a line of text after each finished round.
 
     Returns:
         One dict a case and engine: scene, width, height, gaussians, pass, engine, device, threads,

@@ -59,9 +59,7 @@ def judge(
     """Judge a checkout.
 
     Args:
-        repo: the checkout, or an installed package.
         tried: the result of each adapter on it, the nearest first.
-        adapters: all adapters.
         plugins: tell which models it saves, where no adapter fits.
     """
     fitting = closest(tried, adapters)
@@ -123,8 +121,6 @@ def differences(repo: HostRepo, tried: Tried, elsewhere: str) -> tuple[str, ...]
     """How a checkout differs from an adapter's host, in short lines.
 
     Args:
-        repo: the checkout.
-        tried: the adapter's result.
         elsewhere: where the model is, as text; "" if it is where the adapter looks.
     """
     lines: dict[str, None] = {elsewhere: None} if elsewhere else {}

@@ -56,8 +56,6 @@ class Command(click.Command):
 
     Args:
         rules: which of its options exclude or need each other; checked before anything is done.
-        args: of click's class, as ``kwargs``.
-        kwargs: likewise.
     """
 
     def __init__(self, *args: Any, rules: Rules = (), **kwargs: Any) -> None:
@@ -179,7 +177,6 @@ def usage_error(error: click.UsageError, words: list[str]) -> Exception:
     """The exception to raise for a usage error. With --json, prints the error and returns an exit.
 
     Args:
-        error: click's error.
         words: words of the command line. Words after ``--`` belong to the host's command.
     """
     if not speaks():

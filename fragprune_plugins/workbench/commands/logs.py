@@ -51,9 +51,6 @@ class Log(Protocol):
 class CsvLog:
     """A row a step. A fine-tuning that goes on after a kill appends; another one begins anew.
 
-    Args:
-        path: the file.
-
     Raises:
         OutputError: it cannot be written, or holds something else than a log.
     """
@@ -98,9 +95,6 @@ class CsvLog:
 class TensorBoardLog:
     """Scalars under ``fragprune/`` in an event file.
 
-    Args:
-        folder: TensorBoard's log folder.
-
     Raises:
         UsageError: TensorBoard is not installed.
     """
@@ -124,9 +118,6 @@ class TensorBoardLog:
 
 class WandbLog:
     """A run of Weights & Biases. It uses the network, unless WANDB_MODE=offline.
-
-    Args:
-        project: name of the project.
 
     Raises:
         UsageError: wandb is not installed.
@@ -152,7 +143,6 @@ class Bar:
     """A bar on stderr below the host's own, if stderr is a terminal.
 
     Args:
-        total: number of steps.
         warmup: so many of them come before thresholds open.
     """
 
@@ -188,12 +178,7 @@ class _Observer:
 
 @contextlib.contextmanager
 def logging_steps(logs: Sequence[Log], plugins: Plugins | None = None) -> Iterator[None]:
-    """Write the steps that are taken in a block, and close the logs after it.
-
-    Args:
-        logs: where to write.
-        plugins: the plugins to join; None for those of the process.
-    """
+    """Write the steps that are taken in a block, and close the logs after it."""
     plugins = plugins or installed()
     with contextlib.ExitStack() as stack:
         for number, log in enumerate(logs):

@@ -145,7 +145,6 @@ def own_cameras(record: records.Record, scene: SceneOptions | None = None) -> Ow
     """The cameras of a fine-tuning with --self; None for another record.
 
     Args:
-        record: of the fine-tuning.
         scene: options that were given, which override what the record says.
 
     Raises:

@@ -112,13 +112,7 @@ def engine_options(
     device: str = "Device; auto takes a GPU if our cuda engine can draw on it, else the CPU.",
     default: str = "auto",
 ) -> Callable[[Function], Function]:
-    """The options of ``EngineOptions``, which a command gets as ``engine``.
-
-    Args:
-        what: what the engine is used for, for --help.
-        device: help of ``--device``.
-        default: default of ``--device``.
-    """
+    """The options of ``EngineOptions``, which a command gets as ``engine``."""
     names = "auto (the fastest that runs here), reference, cpu, cuda, or a plugin's engine."
 
     def decorate(function: Function) -> Function:
@@ -196,11 +190,7 @@ class SceneOptions:
     given: frozenset[str] = frozenset()
 
     def as_record(self, cameras: Path | None) -> dict[str, Any]:
-        """The cameras of a model's own pictures as plain values, for records.
-
-        Args:
-            cameras: a file with them.
-        """
+        """The cameras of a model's own pictures as plain values, for records."""
         return {
             "data": None if self.data is None else str(self.data.resolve()),
             "file": None if cameras is None else str(cameras.resolve()),
@@ -210,11 +200,7 @@ class SceneOptions:
 
 
 def scene_options(data: str = f"{DATA_HELP} {TRAINED_ON}") -> Callable[[Function], Function]:
-    """The options of ``SceneOptions``, which a command gets as ``scene``.
-
-    Args:
-        data: help of ``--data``.
-    """
+    """The options of ``SceneOptions``, which a command gets as ``scene``."""
 
     def decorate(function: Function) -> Function:
         @functools.wraps(function)

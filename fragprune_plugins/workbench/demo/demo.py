@@ -68,11 +68,6 @@ def host_command(scene: Path, model: Path, settings: DemoSettings) -> list[str]:
     """The command that trains the host on the scene.
 
     Its flags scale the timetable of densification to the number of iterations.
-
-    Args:
-        scene: the scene's folder.
-        model: the output folder.
-        settings: the demo's settings.
     """
     n = settings.iterations
     flags: dict[str, object] = {
@@ -103,7 +98,6 @@ def run_demo(
 
     Args:
         out: folder for ``scene/``, ``model/``, ``pictures/``, ``index.html`` and ``report.json``.
-        settings: the demo's settings; None for the defaults.
         say: called with one line of text at the start of each part.
 
     Returns:

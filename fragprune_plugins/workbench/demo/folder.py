@@ -51,7 +51,6 @@ def claiming(out: Path, *names: str) -> Iterator[None]:
     This happens also if the block fails, so that the next demo can delete them.
 
     Args:
-        out: the demo's folder.
         names: names in ``out`` that the block writes.
     """
     try:

@@ -39,12 +39,8 @@ def write_page(
     """Write ``pictures/`` and ``index.html``.
 
     Args:
-        out: the demo's folder.
         report: the measurements; "larger" is added, frame times of pictures as large as the page's.
-        scene: folder of the photographs.
         curves: the run's learning curves, one dict per step.
-        engine: name of the engine that draws.
-        device: device of the models.
 
     Returns:
         The files as paths relative to ``out``.

@@ -22,7 +22,6 @@ def make_scene(
     """Copy the photographs, their cameras and points to ``images/`` and ``sparse/0/`` of a folder.
 
     Args:
-        folder: the scene's folder; made if it is missing.
         views: how many photographs, of 48.
         width: width of the photographs in pixels, of 320; the height is three quarters of it.
         points: how many points, of 4000.

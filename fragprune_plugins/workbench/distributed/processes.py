@@ -33,11 +33,7 @@ _COMPARE = 100  # steps from one comparison of replicas to the next
 
 
 class Replicas(Alone):
-    """Processes that each hold the whole model.
-
-    Args:
-        ranks: the processes.
-    """
+    """Processes that each hold the whole model."""
 
     stage = SharedStage
 
@@ -170,7 +166,6 @@ class Shards(Replicas):
     """Processes that each hold a part of the model's Gaussians.
 
     Args:
-        ranks: the processes.
         count: of this process' Gaussians.
     """
 
@@ -244,8 +239,6 @@ def part_of(model: Model, ranks: Ranks, device: torch.device | str) -> Model:
 
     Args:
         model: the same in all processes.
-        ranks: the processes.
-        device: where this one learns and draws.
     """
     count = len(model)
     start, end = (count * rank // ranks.size for rank in (ranks.rank, ranks.rank + 1))

@@ -56,7 +56,6 @@ class ShardedEngine:
 
     Args:
         engine: draws, and is of the same kind in all processes.
-        ranks: the processes.
 
     Attributes:
         sent: Gaussians that this process has sent to others so far.

@@ -109,8 +109,6 @@ def measure_all(
     Args:
         candidates: the splats to measure, all on one device; views move there.
         shots: the views. Figures are means over them.
-        engine: a name or an engine.
-        repeats: number of timed frames for each view and candidate.
         enlarge: timed frames are this many times as wide and high as the pictures.
 
     Returns:
@@ -175,10 +173,6 @@ def covered_per_pixel(engine: Engine, inputs: RasterInputs) -> float:
 
     It is what viewers pay that ignore thresholds and do not ask how faint a Gaussian is. They
     draw quads, whose area is 4 / pi times as large. The pixels are counted, not estimated.
-
-    Args:
-        engine: counts them.
-        inputs: of one rasterization of ``Splats``.
     """
     assert isinstance(inputs.splats, Splats)
     squared = torch.full_like(inputs.splats.opacities, SQUARED_RADIUS)
@@ -196,9 +190,6 @@ def frame_times(
     """Time frames of splats in turns, as ``measure`` does.
 
     Args:
-        candidates: the splats, all on the device of the views.
-        views: the cameras.
-        engine: draws them.
         repeats: number of timed frames for each view and candidate.
 
     Returns:

@@ -51,7 +51,6 @@ def render(template: Path, *others: Path, **values: Any) -> str:
     """A page.
 
     Args:
-        template: the page's template, which extends ``page.html``.
         others: folders of further templates that it extends or includes.
         values: what the template shows; "title" is also the page's heading.
     """

@@ -22,10 +22,7 @@ def draw_panels(
     """Draw evenly spread views: photograph, renders, and fragment densities on one scale.
 
     Args:
-        out: folder for the PNGs.
-        columns: candidates by name.
         shots: the views; ``PANELS`` of them at most are drawn.
-        engine: draws the views.
 
     Returns:
         The files, one for each drawn view.

@@ -43,9 +43,6 @@ def stems(names: Sequence[str]) -> list[str]:
 
     Views of one name get numbers, such as ``r_0`` and ``r_0-2``. What is no letter, digit, space or
     one of ``._+-~()`` becomes ``_``.
-
-    Args:
-        names: of the views, as their files have them.
     """
     taken: set[str] = set()
     found = []
@@ -81,7 +78,6 @@ def save_map(path: Path, values: Tensor, limit: float) -> None:
     """Write values (H, W) as colours, one pixel for each, without a scale: ``colour_stops`` has it.
 
     Args:
-        path: the PNG.
         values: 0 or more.
         limit: the value at the top of the scale; what is larger looks like it.
     """
@@ -107,7 +103,6 @@ def save_panel(path: Path, pictures: Sequence[tuple[str, Tensor]], limit: float)
     """Write pictures side by side under their titles; counts (H, W) become colours.
 
     Args:
-        path: the PNG.
         pictures: (title, picture), where a picture is (3, H, W) RGB or (H, W) counts, of one size.
         limit: the count at the top of the colour scale, which all (H, W) share.
     """

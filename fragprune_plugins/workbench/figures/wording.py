@@ -101,11 +101,7 @@ def tabulate(columns: Mapping[str, dict[str, Any]]) -> list[list[str]]:
 
 
 def nothing_drawn(fragments: Sequence[float]) -> list[str]:
-    """A warning where no Gaussian is seen; [] where each view or measurement has some.
-
-    Args:
-        fragments: per pixel, of each.
-    """
+    """A warning where no Gaussian is seen; [] where each view or measurement has some."""
     empty = sum(each == 0 for each in fragments)
     if not empty:
         return []

@@ -31,8 +31,6 @@ def save(path: Path, tensors: dict[str, Tensor], values: dict[str, Any]) -> None
     """Write a checkpoint durably in the place of the one before.
 
     Args:
-        path: the file.
-        tensors: by name.
         values: whatever JSON can hold; floats come back to the bit.
 
     Raises:

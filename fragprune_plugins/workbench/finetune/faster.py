@@ -164,9 +164,6 @@ def require_reach(target: float, model: Model, shots: Sequence[Shot], engine: En
 
     Args:
         target: ratio of frame times, before over after.
-        model: as it comes in.
-        shots: the training views.
-        engine: draws them.
 
     Raises:
         UsageError: frames with so few fragments as no target leaves take longer.
@@ -207,9 +204,6 @@ def times_faster(
     Args:
         before: drawn without thresholds and stop.
         now: drawn with them; free of gradients, for which an engine would keep states.
-        thresholds: of ``now``, for a rasterization.
-        shots: the views.
-        engine: draws them.
     """
     old, new = before.splats(), now.splats()
     least = {True: [math.inf] * len(shots), False: [math.inf] * len(shots)}

@@ -93,7 +93,6 @@ class Finetuned:
         """Leave a record, and say what came of it.
 
         Args:
-            figures: as ``measured``.
             dataset: whose held-out views it was measured on.
             photographs: where they lie, for the record; None where there are none.
             asked: the configuration, by which the same command is known again.
@@ -153,13 +152,7 @@ class Finetuned:
         return data
 
     def _text(self, data: dict[str, Any], held_out: int, views: int) -> str:
-        """What a person reads.
-
-        Args:
-            data: of the report.
-            held_out: number of held-out views.
-            views: number of all views.
-        """
+        """What a person reads."""
         result, settings, before = self.result, self.result.settings, data["before"]
         pressure = f" at pressure {data['pressure']:.2g}" if settings.goal.presses else ""
         lines = [
@@ -269,11 +262,7 @@ def _describe_bound(found: dict[str, Any], views: int) -> str:
 
 
 def advise_own_pictures(data: dict[str, Any]) -> str | None:
-    """A line for a model that knew better as it came, and could have taught that; else None.
-
-    Args:
-        data: of the report.
-    """
+    """A line for a model that knew better as it came, and could have taught that; else None."""
     photographs = data["target"] != ITSELF and data["self"] is None and data["shards"] == 1
     learned = data["pressure"] is not None and data["settings"]["train"] == "all"
     if not (photographs and learned) or data["after"]["psnr"] > data["before"]["psnr"] - LOST:
@@ -286,12 +275,7 @@ def advise_own_pictures(data: dict[str, Any]) -> str | None:
 
 
 def describe_untruncated(before: dict[str, Any], plain: dict[str, Any]) -> str:
-    """A line on the fine-tuned model without its cutoffs.
-
-    Args:
-        before: measurement of the model before fine-tuning.
-        plain: measurement of the fine-tuned model without thresholds and stop.
-    """
+    """A line on the fine-tuned model without its cutoffs."""
     own = plain["target"] == "itself"
     compared = "against itself" if own else f"({plain['psnr'] - before['psnr']:+.2f})"
     advice = ""

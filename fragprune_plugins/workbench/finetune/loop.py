@@ -119,10 +119,6 @@ class Training:
     Args:
         start: the model as it comes in; not changed.
         dataset: on the model's device.
-        settings: of the fine-tuning.
-        schedule: gives the plan of each step.
-        engine: draws.
-        processes: that learn together.
         target: what thresholds are held to; that of the goal when None.
 
     Attributes:
@@ -202,12 +198,7 @@ class Training:
         return time.perf_counter() - self.started
 
     def learn(self, keeper: Keeper, progress: bool) -> None:
-        """All steps that are not done yet.
-
-        Args:
-            keeper: writes checkpoints.
-            progress: draw a bar on stderr.
-        """
+        """All steps that are not done yet."""
         self.keeper, settings, total = keeper, self.settings, self.settings.iterations
         steps = order(self.dataset.train, total, settings.views_per_step, settings.seed)
         with (

@@ -86,7 +86,6 @@ class Checkpoints:
 
         Args:
             asked: the ``configuration`` of the fine-tuning that is to go on.
-            device: of the tensors.
 
         Raises:
             CheckpointError: it cannot be read, or is another fine-tuning's.
@@ -112,10 +111,6 @@ class Checkpoints:
 
 class Keeper:
     """Takes a training over from its checkpoint, and writes the next ones.
-
-    Args:
-        checkpoints: where they are; None keeps nothing.
-        training: has not begun yet.
 
     Attributes:
         checkpoints: those that this process writes.
@@ -241,9 +236,6 @@ def configuration(
     Args:
         model: as it comes in, with its thresholds.
         dataset: its files are read whole, for their digest.
-        settings: of the fine-tuning.
-        engine: the engine's name.
-        schedule: gives the plan of each step; when None a plugin's, or the default one.
     """
     shots = (*dataset.train, *dataset.test)
     store = model.thresholds

@@ -98,9 +98,6 @@ def strongest(
     Args:
         train: makes one fine-tuning of the model.
         settings: of every training; their goal is ``AtMost``.
-        held_out: views to measure the loss on.
-        engine: draws them.
-        say: called with a line of text before each training.
 
     Raises:
         UsageError: the goal is another one.
@@ -165,7 +162,6 @@ class _Search:
         """Take a training into account, and choose the next pressure.
 
         Args:
-            result: of the training.
             losses: of each held-out view against the control, dB.
             fragments: per pixel, mean over held-out views.
         """
@@ -196,12 +192,7 @@ class _Search:
 
 
 def next_pressure(trials: Sequence[Trial], bound: float) -> float:
-    """The pressure to try next, so that the loss falls just below the bound.
-
-    Args:
-        trials: one or more.
-        bound: dB.
-    """
+    """The pressure to try next, so that the loss falls just below the bound."""
     aim = bound - TOLERANCE / 2
     weaker = max((t for t in trials if t.loss <= aim), key=lambda t: t.pressure, default=None)
     stronger = min((t for t in trials if t.loss > aim), key=lambda t: t.pressure, default=None)

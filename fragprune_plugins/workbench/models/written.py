@@ -43,7 +43,6 @@ def describe_written(out: Path, held: str = "", *, pruned: bool = True) -> str:
     """What a model was written into, and what its format does not keep.
 
     Args:
-        out: the file.
         held: how it holds thresholds, as words; "" where there are none.
         pruned: whether the model has thresholds.
     """
@@ -57,7 +56,6 @@ def dropping(out: Path, bytes_before: int, before: int, after: int) -> dict[str,
     """Counts of dropped Gaussians and bytes, for --json.
 
     Args:
-        out: the file without the dropped Gaussians.
         bytes_before: size of the file with all Gaussians.
         before: number of all Gaussians.
         after: number of Gaussians left.

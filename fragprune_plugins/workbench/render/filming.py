@@ -32,7 +32,6 @@ def orbit(
     """Cameras once around a splat, from ``overview``'s height and distance, evenly spaced.
 
     Args:
-        splat: N Gaussians.
         count: cameras; the one after the last would be the first.
         up: (3,) what is up in its world; COLMAP's worlds have y down.
 
@@ -102,10 +101,8 @@ def write_mp4(path: Path, frames: Iterable[Tensor], fps: int) -> int:
     """Write pictures as an H.264 film; an existing file stays until the film is complete.
 
     Args:
-        path: the film, in .mp4.
         frames: (3, H, W) RGB in [0, 1] each, all of one size. A side of odd length loses its last
             row or column, because H.264 halves the colours' sides.
-        fps: frames a second.
 
     Returns:
         The number of frames.

@@ -120,10 +120,7 @@ def draw_views(
 
     Args:
         folder: for the PNGs, which ``Drawn.files`` names.
-        original: the model before fine-tuning.
-        pruned: the model to compare with it.
         shots: the views; they move to the models' device.
-        engine: draws the views.
         enlarge: how many times as wide and high as the photograph both models are drawn.
     """
 
@@ -161,8 +158,6 @@ def save_banner(path: Path, folder: Path, drawn: Drawn) -> None:
     """Write one view and its fragments side by side, left of a line the original, right the pruned.
 
     Args:
-        path: the JPG.
-        folder: of the pictures that ``draw_views`` drew.
         drawn: what it gave; the first view is taken.
     """
 
@@ -216,7 +211,6 @@ def save_learning(
     Lines and words are grey and the rest is transparent: a page may be light or dark.
 
     Args:
-        path: the PNG.
         curves: one dict a step, from a run's summary; None, in records, is what is not known.
         thresholds: (N,) learned, falloff; None, of a control, leaves out what shows them.
     """

@@ -274,9 +274,7 @@ def _draw(
     """Draw held-out views and learning curves into a folder.
 
     Args:
-        record: the record of the models.
         inside: the folder whose files may be read without ``data``.
-        folder: the folder for the pictures.
         data: the scene folder that the user named.
         opened: opens the engine; called only if there is something to draw.
 

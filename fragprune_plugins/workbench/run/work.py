@@ -151,10 +151,6 @@ def photographs_of(summary: launch.RunSummary) -> dict[str, Any] | None:
 def measure_models(photographs: dict[str, Any], engine: EngineOptions) -> list[dict[str, Any]]:
     """Measure the models on held-out views, on the host's device if an engine can draw there.
 
-    Args:
-        photographs: of ``photographs_of``.
-        engine: what draws.
-
     Returns:
         The measurements before and after; after joint learning the latter alone.
     """

@@ -77,10 +77,6 @@ def find_model(folder: Path) -> Path | None:
 def read(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]]:
     """Read training and held-out views.
 
-    Args:
-        folder: the scene.
-        images: name of the folder with the images.
-
     Raises:
         DatasetError: a file is broken, an image has no camera, or a lens cannot be straightened.
     """

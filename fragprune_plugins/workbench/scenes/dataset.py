@@ -216,10 +216,6 @@ def read_scene(folder: Path, images: str = "images") -> tuple[list[Posed], list[
 
     No image is opened, but for the size of one whose transforms file has no ``w`` and ``h``.
 
-    Args:
-        folder: the scene.
-        images: name of the image folder; see ``load_dataset``.
-
     Raises:
         DatasetError: the folder has neither layout or both, a file is broken, a camera model is
             unknown, or there are no training or no held-out cameras.

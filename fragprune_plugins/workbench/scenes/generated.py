@@ -44,9 +44,6 @@ _BESIDE = (-0.6, 0.6)  # of the way; visitors leave the path of the photographs 
 def bounds(splat: Model) -> tuple[Tensor, float]:
     """Where most of a splat is: the median of the means, and the radius of nine tenths around it.
 
-    Args:
-        splat: N Gaussians, one or more.
-
     Returns:
         (3,) on the CPU, and world units above 0.
     """
@@ -97,7 +94,6 @@ def within(places: Sequence[Tensor], count: int, *, pixels: int = 800) -> Named:
 
     Args:
         places: (3,) each, taken in turns.
-        count: cameras.
         pixels: of each side of their pictures.
     """
     views = []

@@ -51,7 +51,6 @@ def read(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]
     Otherwise every 8th of the sorted names is held out, as of COLMAP's.
 
     Args:
-        folder: the scene.
         images: name of the folder with the images, if it is another than the file says.
 
     Raises:

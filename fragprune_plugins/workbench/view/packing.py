@@ -37,9 +37,6 @@ def pack(model: Model) -> tuple[bytes, dict[str, Any]]:
     Cutoffs are within 1e-4 of the model's, opacities within 1e-5, and scales within 0.02 % where
     the largest is e^12 times the least.
 
-    Args:
-        model: N Gaussians.
-
     Returns:
         The bytes, and: ``gaussians``, ``degree``, ``truncated`` (has thresholds), ``stop`` (after
         which pixels soon end; None for none), ``rim`` (which is always hard there), ``scales``

@@ -27,7 +27,6 @@ def open_server(site: Site, port: int = 0) -> ThreadingHTTPServer:
     """A server of these files, bound to 127.0.0.1; ``serve_forever`` runs it.
 
     Args:
-        site: the files. No other is ever read.
         port: 0 for any free one.
 
     Raises:

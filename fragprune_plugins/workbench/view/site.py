@@ -89,8 +89,6 @@ def make_site(
     """All files of a viewer.
 
     Args:
-        title: of the page.
-        models: one or two.
         layers: one or two; the first is on the left.
         cameras: to choose from; may be none.
         start: the first camera; its background is the page's.

@@ -119,7 +119,6 @@ def read(path: Path, *, filtered: bool = False) -> Model:
     """Read a model of any format; thresholds that the file itself holds are in the result.
 
     Args:
-        path: the file.
         filtered: accept a PLY that the caller draws by its host's rules, as ``read_ply`` does.
 
     Raises:
@@ -140,9 +139,7 @@ def write(form: Format, new: Path, model: Model) -> None:
     """Write a model into a file that does not exist yet.
 
     Args:
-        form: the format.
         new: the file, in a folder that ``atomic.staging`` or ``atomic.replacing`` gave.
-        model: the Gaussians, and their thresholds if they have any.
 
     Raises:
         OutputError: the format cannot hold the model or its thresholds.

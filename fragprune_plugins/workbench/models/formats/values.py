@@ -151,7 +151,6 @@ def turned(splat: Model, signs: tuple[int, int, int]) -> Model:
     """The same scene with axes negated: means, rotations and SH of degrees 1 to 3.
 
     Args:
-        splat: the scene.
         signs: of x, y and z, 1 or -1.
     """
     x, y, z = signs
