@@ -22,10 +22,11 @@ if TYPE_CHECKING:
     from fragprune_plugins.learning.goals import Control, Fewer, Portable, Pressure
     from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
     from fragprune_plugins.learning.thresholds import ThresholdStore
-    from fragprune_plugins.plugins.hooks import engine_for, rasterize
+    from fragprune_plugins.plugins.hooks import engine_for
     from fragprune_plugins.types import Footprints, RasterInputs, RasterOutputs, Splats, View
     from fragprune_plugins.workbench.distributed.processes import part_of, whole_of
     from fragprune_plugins.workbench.distributed.sharded import ShardedEngine
+    from fragprune_plugins.workbench.figures.drawing import rasterize
     from fragprune_plugins.workbench.figures.evaluate import measure
     from fragprune_plugins.workbench.figures.viewing import overview, render_view
     from fragprune_plugins.workbench.finetune.api import finetune
@@ -47,10 +48,11 @@ _NAMES = {
     "learning.goals": "Control Fewer Portable Pressure",
     "learning.schedule": "Schedule Settings StepPlan",
     "learning.thresholds": "ThresholdStore",
-    "plugins.hooks": "engine_for rasterize",
+    "plugins.hooks": "engine_for",
     "types": "Footprints RasterInputs RasterOutputs Splats View",
     "workbench.distributed.processes": "part_of whole_of",
     "workbench.distributed.sharded": "ShardedEngine",
+    "workbench.figures.drawing": "rasterize",
     "workbench.figures.evaluate": "measure",
     "workbench.figures.viewing": "overview render_view",
     "workbench.finetune.api": "finetune",

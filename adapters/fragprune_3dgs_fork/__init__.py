@@ -138,11 +138,7 @@ class ForkDialect(GraphdecoDialect):
         return inputs
 
     def expect_off(self, call: HostCall) -> None:
-        """Refuse a call with a value where the source has None or False by default.
-
-        Raises:
-            EngineError: it has one.
-        """
+        """Refuse a call with a value where the source has None or False by default."""
         for name in sorted(self.fork.off):
             value = getattr(call.settings, name, call.arguments.get(name))
             empty = getattr(value, "shape", ())[:1] == (0,)

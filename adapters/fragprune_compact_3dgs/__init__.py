@@ -104,11 +104,7 @@ class Compact3DGS(GraphdecoAdapter):
     )
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
-        """Refuse: no command can resume this host's training.
-
-        Raises:
-            UsageError: always.
-        """
+        """Refuse: no command can resume this host's training."""
         raise UsageError(
             "stage 2 of Compact-3DGS",
             "checkpoints without its mask and its colour network: the host cannot resume them",

@@ -83,11 +83,7 @@ def thresholds_of(
 
 
 def belongs(model: Path) -> bool:
-    """Whether a model file has a sidecar that was written for the file's present content.
-
-    Raises:
-        SidecarError: the sidecar cannot be read.
-    """
+    """Whether a model file has a sidecar that was written for the file's present content."""
     path = find(model)
     return path is not None and _read(model, path)[1].model_sha256 == digest(model)
 

@@ -14,11 +14,7 @@ from fragprune_plugins.injection.state import SessionState
 
 
 def on_parents(session: SessionState, call: SeamCall) -> Any:
-    """Note the parents before the host copies them.
-
-    Raises:
-        AlignmentError: a parent got no child.
-    """
+    """Note the parents before the host copies them."""
     state = session.models.get(call.model)
     if state is None:
         return call.run()

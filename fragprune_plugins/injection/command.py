@@ -92,9 +92,6 @@ class HostCommand:
         Args:
             scratch: folder for that copy.
             extra: values by field of ``CommandLine``.
-
-        Raises:
-            UsageError: the configuration file cannot hold a value.
         """
         given = {self.line.spellings(name)[-1]: value for name, value in extra.items()}
         out = list(self.arguments)
@@ -156,9 +153,6 @@ def _script_of(module: str) -> Path:
     """The file that ``python -m module`` runs, found without importing it.
 
     The current folder goes before installed packages.
-
-    Raises:
-        UsageError: there is no such module.
     """
     for repo in (HostRepo(Path.cwd()), HostRepo.installed(module.split(".")[0])):
         script = repo.path(module) if repo else None

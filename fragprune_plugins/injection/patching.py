@@ -143,9 +143,6 @@ class PatchLedger:
 
         For a function outside the host (``seam.external``), only copies in the host's modules
         count.
-
-        Raises:
-            LateImportError: names these modules.
         """
         head = seam.attribute.split(".")[0]
         if head != seam.attribute:

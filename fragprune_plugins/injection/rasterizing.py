@@ -216,9 +216,6 @@ def proved_answer(
     """What answers a call, once the host's own rasterizer is proved, if it needs and can be.
 
     A later call of a stage in which nothing of ours draws may fail: stage 2 would refuse it.
-
-    Raises:
-        ProofError: it draws otherwise than our engine.
     """
     ours, prover = state is not None and state.store.cuts, session.dialect.prover
     if not session.prove and not ours:

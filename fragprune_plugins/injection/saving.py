@@ -165,11 +165,7 @@ def restore_rates(session: SessionState, model: Any) -> None:
 
 
 def rows_of(means: Tensor, among: Tensor, where: str) -> Tensor:
-    """(M,) int64: for each mean (M, 3), the first row of ``among`` (N, 3) with the same bits.
-
-    Raises:
-        AlignmentError: a mean has no such row.
-    """
+    """(M,) int64: for each mean (M, 3), the first row of ``among`` (N, 3) with the same bits."""
     known, wanted = among.detach().cpu().numpy(), means.numpy()
     both = np.concatenate([known, wanted])
     _, first, which = np.unique(both, axis=0, return_index=True, return_inverse=True)

@@ -311,11 +311,7 @@ class Stages:
             return None, {}, error
 
     def _densified(self) -> int:
-        """The iteration after which the host's densification is over.
-
-        Raises:
-            UsageError: the host does not tell.
-        """
+        """The iteration after which the host's densification is over."""
         host = self.host
         end = self.adapter.densified(self.repo, host.script, host.arguments)
         if end is None:
@@ -334,9 +330,6 @@ class Stages:
 
         Args:
             from_iter: the option, or the end of the host's densification.
-
-        Raises:
-            UsageError: nothing would be learned.
         """
         total, file = self.host.iterations, self.host.flags.resume
         if file:

@@ -103,9 +103,6 @@ def remember(start: Start, host: HostCommand, commit: str) -> None:
 
     Args:
         host: its command. Without an output folder in it there is no mark.
-
-    Raises:
-        OutputError: the mark cannot be written.
     """
     if host.output is not None and host.output.is_dir():
         with replacing(host.output / FINISHED) as mark:
@@ -142,12 +139,7 @@ def _identity(path: Path, host: HostCommand, commit: str) -> str:
 
 
 def resumed_at(line: CommandLine, checkpoint: Path) -> int:
-    """The iteration after which a run from this checkpoint continues.
-
-    Raises:
-        UsageError: the checkpoint does not exist.
-        ModelFileError: the checkpoint cannot be read.
-    """
+    """The iteration after which a run from this checkpoint continues."""
     return 0 if line.restarts else _read_checkpoint(checkpoint)[1]
 
 
@@ -178,11 +170,7 @@ def _learned(path: Path) -> bool:
 
 
 def _iteration_of_ply(ply: Path) -> int:
-    """The iteration in the name of a PLY's folder, ``iteration_N/point_cloud.ply``.
-
-    Raises:
-        UsageError: the file is missing, or its folder has another name.
-    """
+    """The iteration in the name of a PLY's folder, ``iteration_N/point_cloud.ply``."""
     number = ply.parent.name.removeprefix("iteration_")
     if ply.is_file() and number.isdigit():
         return int(number)
@@ -195,12 +183,7 @@ def _iteration_of_ply(ply: Path) -> int:
 
 
 def _read_checkpoint(path: Path) -> tuple[Any, int]:
-    """Read (capture, iteration) of a checkpoint; tensors are mapped from the file.
-
-    Raises:
-        UsageError: the checkpoint does not exist.
-        ModelFileError: the checkpoint cannot be read.
-    """
+    """Read (capture, iteration) of a checkpoint; tensors are mapped from the file."""
     import torch
 
     if not path.exists():

@@ -241,11 +241,7 @@ class SessionState:
             self.write_sidecar(path, state.store, whole)
 
     def write_sidecar(self, path: Path, store: ThresholdStore, whole: Path | None = None) -> None:
-        """Write a store's sidecar beside a file and tell observers; see ``save``.
-
-        Raises:
-            DivergedError: thresholds are not finite.
-        """
+        """Write a store's sidecar beside a file and tell observers; see ``save``."""
         about: dict[str, Any] = {
             "adapter": self.adapter.name,
             "host_commit": self.repo.commit,

@@ -90,11 +90,7 @@ class Nvrtc:
         self.architectures = tuple(sorted(int(a) for a in found if a >= OLDEST))
 
     def compile(self, source: str, macros: dict[str, int], target: str) -> Image:
-        """Compile native/cuda/``source``.cu for a target like sm_90 or compute_90.
-
-        Raises:
-            Unavailable: the source does not compile; the message has the log.
-        """
+        """Compile native/cuda/``source``.cu for a target like sm_90 or compute_90."""
         text = (SOURCES / f"{source}.cu").read_bytes()
         program = self._call(
             "nvrtcCreateProgram", text, f"{source}.cu".encode(), 1, [_STDINT], [b"stdint.h"]

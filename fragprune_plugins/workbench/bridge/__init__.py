@@ -56,11 +56,7 @@ def command(viewer: str | None, out: Path | None) -> Report:
 
 
 def _module(point: EntryPoint) -> Path:
-    """The module of an installed bridge.
-
-    Raises:
-        PluginError: its package cannot be imported, or names no file.
-    """
+    """The module of an installed bridge."""
     path = Path(getattr(load(point, ModuleType), "MODULE", "MODULE"))
     if not path.is_file():
         raise PluginError(

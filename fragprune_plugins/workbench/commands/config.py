@@ -52,11 +52,7 @@ def _read_config(ctx: click.Context, param: click.Parameter, value: Path | None)
 
 
 def _as_words(option: click.Option, setting: Any) -> Any:
-    """What a line would say in place of a TOML value, so that both are read alike.
-
-    Raises:
-        ValueError: no line can say it.
-    """
+    """What a line would say in place of a TOML value, so that both are read alike."""
     if setting is True and isinstance(option.flag_value, str):  # its value may be left out
         return option.flag_value
     if isinstance(setting, bool) != option.is_flag or isinstance(setting, list) != option.multiple:

@@ -138,12 +138,7 @@ def _recorded_cameras(scene: SceneOptions, *models: Path) -> OwnCameras | None:
 
 
 def _photographs(scene: SceneOptions, known: dict[Path, Recorded], *models: Path) -> Photographs:
-    """The photographs that the options name; else those of the records or of the trainings.
-
-    Raises:
-        UsageError: there is no folder, and nothing says which, or the models differ in it.
-        DatasetError: a training's arguments cannot be read.
-    """
+    """The photographs that the options name; else those of the records or of the trainings."""
     read = {each.photographs for each in known.values()}
     if not read and scene.data is None:
         read = {each for each in map(trained_on, models) if each is not None}

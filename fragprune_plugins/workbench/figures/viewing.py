@@ -11,8 +11,8 @@ import torch
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.plugins.hooks import rasterize
 from fragprune_plugins.types import RasterInputs, View
+from fragprune_plugins.workbench.figures.drawing import rasterize
 from fragprune_plugins.workbench.figures.pictures import picture
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.scenes.generated import bounds

@@ -50,11 +50,7 @@ class FrameTarget(Target):
         self.timed = 0  # of CLOCKED_AT
 
     def attach(self, training: Any) -> None:
-        """Check that thresholds can reach the ratio.
-
-        Raises:
-            UsageError: they cannot.
-        """
+        """Check that thresholds can reach the ratio."""
         require_reach(self.ratio, training.start, training.dataset.train, training.engine)
         self.training = training
 

@@ -237,11 +237,7 @@ class _Source:
 
 
 def _source(record: Record, data: Path | None) -> _Source | None:
-    """The source of a record's views; ``data`` is the scene that the user named.
-
-    Raises:
-        RecordError: the record is malformed.
-    """
+    """The source of a record's views; ``data`` is the scene that the user named."""
     own = own_cameras(record)
     if own is not None:
         with DOOR.stated(record.path):

@@ -69,11 +69,7 @@ def load_cameras(path: str | Path, *, white_background: bool = False) -> list[tu
 def load_scene_cameras(
     folder: Path, *, white_background: bool = False
 ) -> tuple[list[tuple[str, View]], list[tuple[str, View]]]:
-    """Read the named training and held-out views of a scene folder, at their cameras' own sizes.
-
-    Raises:
-        DatasetError: see ``dataset.read_scene``.
-    """
+    """Read the named training and held-out views of a scene folder, at their cameras' own sizes."""
     background = torch.full((3,), float(white_background))
     train, test = (
         [(row.name, row.camera.view(background)) for row in part] for part in read_scene(folder)

@@ -79,9 +79,6 @@ def read_transforms(path: Path, images: str = "images") -> list[Posed]:
     Every number may stand in a frame or in the file. Intrinsics are ``fl_x, fl_y, cx, cy`` where
     given, else ``camera_angle_x`` and a centred principal point; ``w, h`` where given, else the
     size of the image. Poses are taken as they stand: an ``applied_transform`` has been applied.
-
-    Raises:
-        DatasetError: see ``read``.
     """
     content = load_json(path)
     with _TRANSFORMS.stated(path) as reading:
@@ -93,11 +90,7 @@ def read_transforms(path: Path, images: str = "images") -> list[Posed]:
 
 
 def load_json(path: Path) -> Any:
-    """Read a JSON file.
-
-    Raises:
-        DatasetError: the file is missing or not JSON.
-    """
+    """Read a JSON file."""
     with _JSON.reading(path) as reading:
         return reading.json()
 
