@@ -205,13 +205,8 @@ class View:
 
     def to(self, device: torch.device | str) -> View:
         """The same camera with its tensors on a device."""
-        return replace(
-            self,
-            viewmatrix=self.viewmatrix.to(device),
-            projmatrix=self.projmatrix.to(device),
-            campos=self.campos.to(device),
-            background=self.background.to(device),
-        )
+        tensors = ("viewmatrix", "projmatrix", "campos", "background")
+        return replace(self, **{name: getattr(self, name).to(device) for name in tensors})
 
     @classmethod
     def pinhole(

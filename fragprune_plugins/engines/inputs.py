@@ -1,15 +1,16 @@
-"""One rasterization in the form that compiled code reads: arrays and a struct."""
+"""What calls of compiled code share: tensors as arrays, the inputs as a struct, memory, errors."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, get_args
 
 import torch
 
 from fragprune_plugins.constants import THREADS_MAX
-from fragprune_plugins.engines.arrays import address, plain
 from fragprune_plugins.engines.cpu import binding
+from fragprune_plugins.errors import EngineError
 from fragprune_plugins.types import Compensation, Splats
 
 if TYPE_CHECKING:
@@ -19,6 +20,49 @@ if TYPE_CHECKING:
 
 _COMPENSATIONS: Final = get_args(Compensation)
 """In the order of enum fragprune_compensation."""
+
+SMALL = 1 << 16
+"""Bytes below which the C library has memory at hand itself."""
+
+
+def plain(
+    tensor: Tensor, where: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
+) -> Tensor:
+    """The tensor's values, contiguous on a device, as 4-byte numbers."""
+    return tensor.detach().to(where, dtype).contiguous()
+
+
+def address(tensor: Tensor | None) -> int | None:
+    """The address of a tensor's first number; None for no tensor or an empty one."""
+    return None if tensor is None or tensor.numel() == 0 else tensor.data_ptr()
+
+
+def empty(workspace: binding.Workspace, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Like torch.empty for 4-byte numbers, but large tensors reuse memory of a workspace.
+
+    Fresh memory is slow: the system clears it page by page, which takes longer than filling it.
+    """
+    size = 4 * math.prod(shape)
+    if size < SMALL:
+        return torch.empty(shape, dtype=dtype)
+    return torch.frombuffer(workspace.take(size), dtype=dtype).view(shape)
+
+
+def expect_ok(status: int, error: binding.Error) -> None:
+    """Raise what a call's status says.
+
+    Raises:
+        MemoryError: there is not enough memory.
+        EngineError: the inputs were refused.
+    """
+    if status == binding.OK:
+        return
+    text = error.message.decode(errors="replace")
+    if status == binding.OUT_OF_MEMORY:
+        raise MemoryError(f"fragprune's cpu engine: {text}")
+    raise EngineError(
+        "engine 'cpu'", text, "inputs it can draw", "Check the camera and the Gaussians."
+    )
 
 
 def native_arrays(

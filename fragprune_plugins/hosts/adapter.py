@@ -306,21 +306,19 @@ class HostAdapter(ABC):
     def match(self, repo: HostRepo) -> Match:
         """Check fingerprint and seams. An adapter that raises does not fit."""
         try:
-            states = look_up(repo, self.seams_for(repo))
-            seams = (each.finding for each in states if each.finding)
-            findings = [*self.fingerprint(repo), *seams]
+            seams = look_up(repo, self.seams_for(repo))
+            findings = [*self.fingerprint(repo), *(each.finding for each in seams if each.finding)]
         except Exception as error:  # the adapter's own; others are still tried
-            findings = [
-                Finding.error(
-                    "adapter-failed",
-                    f"adapter {self.name}",
-                    f"{type(error).__name__}: {error}",
-                    "an adapter that reads any folder",
-                    "Report it to the adapter's author.",
-                )
-            ]
+            failed = Finding.error(
+                "adapter-failed",
+                f"adapter {self.name}",
+                f"{type(error).__name__}: {error}",
+                "an adapter that reads any folder",
+                "Report it to the adapter's author.",
+            )
+            return Match(self.name, False, (failed,))
         fits = not any(finding.level == "error" for finding in findings)
-        return Match(self.name, fits, tuple(findings))
+        return Match(self.name, fits, tuple(findings), tuple(seams))
 
     @abstractmethod
     def dialect(self, repo: HostRepo) -> Dialect:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from fragprune_plugins.errors import UnknownHostError
 from fragprune_plugins.hosts.adapter import HostAdapter, ScriptAdapter
 from fragprune_plugins.hosts.findings import Finding, Match
-from fragprune_plugins.hosts.source import HostRepo, SeamState, look_up
+from fragprune_plugins.hosts.source import HostRepo
 
 _SHORT = 100
 """Characters of a line that sums an adapter up."""
@@ -22,22 +22,20 @@ class Tried:
     Attributes:
         adapter: the adapter.
         match: the result of its fingerprint and its seams.
-        seams: the state of each seam in the source.
     """
 
     adapter: HostAdapter
     match: Match
-    seams: list[SeamState]
 
     @property
     def held(self) -> int:
         """The number of seams that are as the adapter needs them."""
-        return sum(state.status == "found" for state in self.seams)
+        return sum(state.status == "found" for state in self.match.seams)
 
     @property
     def looked_up(self) -> int:
         """The number of seams that the source can decide."""
-        return sum(state.status != "at import" for state in self.seams)
+        return sum(state.status != "at import" for state in self.match.seams)
 
     @property
     def order(self) -> tuple[bool, float, int, int]:
@@ -67,12 +65,7 @@ class Tried:
 
 def attempt(repo: HostRepo, adapters: Sequence[HostAdapter]) -> list[Tried]:
     """Try each adapter on a codebase; returns the results, best fit first."""
-    tried = []
-    for adapter in adapters:
-        match = adapter.match(repo)
-        failed = any(finding.code == "adapter-failed" for finding in match.findings)
-        seams = [] if failed else look_up(repo, adapter.seams_for(repo))
-        tried.append(Tried(adapter, match, seams))
+    tried = (Tried(adapter, adapter.match(repo)) for adapter in adapters)
     return sorted(tried, key=lambda each: each.order)
 
 

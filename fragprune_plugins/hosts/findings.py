@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Literal
 
+from fragprune_plugins.hosts.seams import Seam
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -36,12 +38,30 @@ class Finding:
 
 
 @dataclass(frozen=True)
+class SeamState:
+    """The state of a seam in the source.
+
+    Attributes:
+        seam: the seam.
+        status: "at import" where the source cannot tell, because the module is compiled.
+        at: "file:line" of the function, or of the place where it was expected; "" at import.
+        finding: the error, where there is one.
+    """
+
+    seam: Seam
+    status: Literal["found", "changed", "missing", "at import"]
+    at: str = ""
+    finding: Finding | None = None
+
+
+@dataclass(frozen=True)
 class Match:
-    """Whether one adapter fits one folder, with the findings."""
+    """Whether one adapter fits one folder, with the findings and the state of each seam."""
 
     adapter: str
     fits: bool
     findings: tuple[Finding, ...] = ()
+    seams: tuple[SeamState, ...] = ()
 
 
 @dataclass(frozen=True)

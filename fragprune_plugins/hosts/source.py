@@ -7,16 +7,14 @@ import os
 import re
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
 from importlib.metadata import distributions
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal
 
 from fragprune_plugins.errors import UnknownHostError
 from fragprune_plugins.files.reading import MEBIBYTE, Door, lies_in
-from fragprune_plugins.hosts.findings import Finding
+from fragprune_plugins.hosts.findings import Finding, SeamState
 from fragprune_plugins.hosts.seams import Seam
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
@@ -247,23 +245,6 @@ class HostRepo:
             commit, _, name = line.partition(" ")
             found += [commit] if name == reference[1] else []
         return next((each for each in found if _COMMIT.fullmatch(each)), "")
-
-
-@dataclass(frozen=True)
-class SeamState:
-    """The state of a seam in the source.
-
-    Attributes:
-        seam: the seam.
-        status: "at import" where the source cannot tell, because the module is compiled.
-        at: "file:line" of the function, or of the place where it was expected; "" at import.
-        finding: the error, where there is one.
-    """
-
-    seam: Seam
-    status: Literal["found", "changed", "missing", "at import"]
-    at: str = ""
-    finding: Finding | None = None
 
 
 def look_up(repo: HostRepo, seams: Iterable[Seam]) -> list[SeamState]:

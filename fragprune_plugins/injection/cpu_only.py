@@ -11,7 +11,7 @@ import functools
 import importlib
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 from unittest import mock
 
@@ -110,13 +110,9 @@ def cpu_only() -> Iterator[None]:
     def load_to_cpu(f: Any, map_location: Any = None, *args: Any, **kwargs: Any) -> Any:
         return load(f, _redirected(map_location or "cpu"), *args, **kwargs)
 
-    patches: list[Callable[[], Any]] = [
-        functools.partial(mock.patch.object, torch.cuda, name, substitute)
-        for name, substitute in _SUBSTITUTES.items()
-    ]
-    with contextlib.ExitStack() as stack:
-        for patch in patches:
-            stack.enter_context(patch())
-        stack.enter_context(mock.patch.object(torch, "load", load_to_cpu))
-        stack.enter_context(_Redirect())
+    with (
+        mock.patch.multiple(torch.cuda, **_SUBSTITUTES),
+        mock.patch.object(torch, "load", load_to_cpu),
+        _Redirect(),
+    ):
         yield

@@ -75,11 +75,12 @@ def surroundings(device: str) -> Iterator[None]:
     from fragprune_plugins.engines.cpu.memory import keep_freed_memory
     from fragprune_plugins.injection.cpu_only import cpu_only
 
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(host_checkpoints())
-        stack.enter_context(_host_pictures())
-        stack.enter_context(mock.patch.object(os, "execv", _refuse_to_start_again))
-        stack.enter_context(cpu_only() if device == "cpu" else current_gpu(device))
+    with (
+        host_checkpoints(),
+        _host_pictures(),
+        mock.patch.object(os, "execv", _refuse_to_start_again),
+        cpu_only() if device == "cpu" else current_gpu(device),
+    ):
         if device == "cpu":
             keep_freed_memory()
         yield

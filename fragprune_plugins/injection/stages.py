@@ -207,19 +207,16 @@ class Stages:
             origin=self.around,
             **options,
         )
-        known = set(sys.modules)
-        host = self.host
+        known, host = set(sys.modules), self.host
+        folder = Path.cwd() if host.module else host.script.parent
         try:
-            with contextlib.ExitStack() as stack:
-                stack.enter_context(process.telling(host.script, self.repo.root))
-                stack.enter_context(session)
-                folder = Path.cwd() if host.module else host.script.parent
-                stack.enter_context(
-                    process.host_process(host.script, arguments, self.device, folder)
-                )
-                stack.enter_context(workers.prepared(session, self.device))
-                if learn:
-                    stack.enter_context(sigterm_interrupts())
+            with (
+                process.telling(host.script, self.repo.root),
+                session,
+                process.host_process(host.script, arguments, self.device, folder),
+                workers.prepared(session, self.device),
+                sigterm_interrupts() if learn else contextlib.nullcontext(),
+            ):
                 try:
                     process.run_main(host.script, host.module)
                 except KeyboardInterrupt as error:  # the session still writes sidecars

@@ -63,7 +63,19 @@ class Goal:
 
 
 @dataclass(frozen=True)
-class Pressure(Goal):
+class _Weighted(Goal):
+    """A goal with a weight, lambda, which a number may give."""
+
+    weight: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.weight is not None and not 0 <= number("pressure", self.weight) < 1:
+            expected = "0 <= X < 1 (1e-4 is usual)"
+            raise UsageError("pressure", f"{self.weight:g}", expected, "Change it.")
+
+
+@dataclass(frozen=True)
+class Pressure(_Weighted):
     """Truncate under a pressure on drawn fragments.
 
     Attributes:
@@ -72,10 +84,6 @@ class Pressure(Goal):
     """
 
     name: ClassVar[str] = "pressure"
-    weight: float | None = None
-
-    def __post_init__(self) -> None:
-        _expect_weight(self.weight)
 
     def pressure(self, elasticity: float, itself: bool) -> PressureRule:
         """The weight; without one, elastic, or fixed where there is no loss to follow."""
@@ -109,7 +117,7 @@ class Fewer(Goal):
 
 
 @dataclass(frozen=True)
-class Portable(Goal):
+class Portable(_Weighted):
     """For viewers that ignore thresholds: learn none, and cover less area.
 
     Attributes:
@@ -120,10 +128,6 @@ class Portable(Goal):
     name: ClassVar[str] = "portable"
     learns: ClassVar[bool] = False
     on_area: ClassVar[bool] = True
-    weight: float | None = None
-
-    def __post_init__(self) -> None:
-        _expect_weight(self.weight)
 
     def pressure(self, elasticity: float, itself: bool) -> PressureRule:
         """The weight; without one, elastic, or fixed where there is no loss to follow."""
@@ -180,8 +184,3 @@ def expect(what: str, value: float, above: float, most: float, expected: str) ->
     """Raise UsageError unless a number is above one and at most another."""
     if not above < number(what, value) <= most:
         raise UsageError(what, f"{value:g}", expected, "Choose another.")
-
-
-def _expect_weight(weight: float | None) -> None:
-    if weight is not None and not 0 <= number("pressure", weight) < 1:
-        raise UsageError("pressure", f"{weight:g}", "0 <= X < 1 (1e-4 is usual)", "Change it.")

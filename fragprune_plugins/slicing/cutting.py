@@ -15,13 +15,18 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from fragprune_plugins.engines import create_engine
-from fragprune_plugins.engines.arrays import address, plain
 from fragprune_plugins.engines.cpu import binding
-from fragprune_plugins.engines.cpu.calling import empty, expect_ok
 from fragprune_plugins.engines.cpu.engine import CpuEngine
 from fragprune_plugins.engines.cuda.engine import CudaEngine
 from fragprune_plugins.engines.cuda.frame import Device, blocks_of, launch
-from fragprune_plugins.engines.inputs import native_lengths, native_threads
+from fragprune_plugins.engines.inputs import (
+    address,
+    empty,
+    expect_ok,
+    native_lengths,
+    native_threads,
+    plain,
+)
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import EngineError, InputError
 from fragprune_plugins.slicing import structs

@@ -10,9 +10,8 @@ import spacetime
 import torch
 from footprints import footprints_of
 
-from fragprune_plugins.engines.arrays import address
 from fragprune_plugins.engines.cpu.engine import CpuEngine, binding
-from fragprune_plugins.engines.inputs import native_arrays, native_inputs
+from fragprune_plugins.engines.inputs import address, native_arrays, native_inputs
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import EngineError
 from fragprune_plugins.slicing.cutting import slice_by

@@ -10,10 +10,16 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch.autograd.function import once_differentiable
 
-from fragprune_plugins.engines.arrays import address, plain
 from fragprune_plugins.engines.cpu import binding
-from fragprune_plugins.engines.cpu.calling import empty, expect_ok
-from fragprune_plugins.engines.inputs import native_arrays, native_inputs, native_threads
+from fragprune_plugins.engines.inputs import (
+    address,
+    empty,
+    expect_ok,
+    native_arrays,
+    native_inputs,
+    native_threads,
+    plain,
+)
 from fragprune_plugins.types import RasterOutputs, Splats
 
 if TYPE_CHECKING:

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from fragprune_plugins.engines import create_engine
-from fragprune_plugins.engines.arrays import address
 from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.engines.cuda import driver
 from fragprune_plugins.engines.cuda.engine import CudaEngine
@@ -30,6 +29,7 @@ from fragprune_plugins.engines.cuda.frame import (
     launch_sort,
 )
 from fragprune_plugins.engines.cuda.self_check import BEGUN, COULD_NOT_RUN, FAILS
+from fragprune_plugins.engines.inputs import address
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import KernelError
 from fragprune_plugins.types import RasterInputs, Splats, View

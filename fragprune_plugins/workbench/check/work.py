@@ -155,10 +155,10 @@ def _in_full(tried: list[Tried], fitting: list[Tried]) -> list[str]:
     shown = fitting or tried[:1]
     lines = []
     for each in shown:
-        info, of_seams = each.adapter.info, [state.finding for state in each.seams]
+        info, of_seams = each.adapter.info, [state.finding for state in each.match.seams]
         lines += ["", f"{each.verdict()} ({info.title}, {info.repo})"]
         lines += [f"  {finding}" for finding in each.match.findings if finding not in of_seams]
-        for state in each.seams:
+        for state in each.match.seams:
             at = state.at if state.status == "found" else f"{_SIGNS[state.status]} {state.at}"
             if state.finding and state.status == "changed":
                 at += f": {state.finding.found}; expected {state.finding.expected}"
@@ -186,7 +186,7 @@ def _as_dict(tried: Tried) -> dict[str, Any]:
                 "status": state.status,
                 "at": state.at,
             }
-            for state in tried.seams
+            for state in tried.match.seams
         ],
     }
 
