@@ -29,8 +29,6 @@ class Block:
     """A rectangle of the image with the footprints that may draw there.
 
     Attributes:
-        x: its columns, pixels.
-        y: its rows, pixels.
         rows: (K,) of the footprints, front to back.
     """
 

@@ -103,11 +103,7 @@ IN_PLACE: dict[str, type[Unread]] = {"unread": Unread, "unproved": Unproved}
 
 @dataclass(frozen=True)
 class ForkDialect(GraphdecoDialect):
-    """The calls of a fork, with the values back that its source names.
-
-    Attributes:
-        fork: what was read of it.
-    """
+    """The calls of a fork, with the values back that its source names."""
 
     fork: Fork = field(kw_only=True)
 

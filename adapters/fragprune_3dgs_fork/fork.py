@@ -61,7 +61,6 @@ class Draw:
     """A drawing function that a training script reaches.
 
     Attributes:
-        function: its name.
         camera: its parameter with the camera.
         model: its parameter with the model.
         calls: of a rasterizer, in source order.
@@ -78,7 +77,6 @@ class Fork:
     """What was read of a checkout.
 
     Attributes:
-        repo: the checkout.
         findings: errors, why it cannot be served; warnings, what is not proved.
         scripts: training scripts, the usual one first.
         unserved: the others that train such a model, with the reason.

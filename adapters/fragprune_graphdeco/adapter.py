@@ -102,7 +102,6 @@ class GraphdecoDialect(Dialect):
     """The call of diff_gaussian_rasterization and its forks.
 
     Attributes:
-        package: import name of the rasterizer.
         settings: field names of GaussianRasterizationSettings, as this revision passes them.
         outputs: number of values that the host unpacks.
         sparse_adam: the revision looks for SparseGaussianAdam in the package.

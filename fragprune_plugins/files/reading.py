@@ -41,9 +41,7 @@ class Reading:
     """A file that is being read.
 
     Attributes:
-        path: the file.
         file: open, at its beginning.
-        size: bytes of the file.
         place: where in the file the parser is, in words for a message; "" where there is none.
     """
 
@@ -93,8 +91,6 @@ class Door:
         error: the class of every error.
         broken: what is said of a file that cannot be parsed, such as "not readable as PLY".
         expected: what the file should be.
-        remedy: what to do about a file that is broken.
-        limit: most bytes of a file.
         missing: what to do about a file that is missing.
         noun: what is missing then.
     """

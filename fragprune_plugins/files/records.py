@@ -34,7 +34,6 @@ class Record:
     """The figures of one command.
 
     Attributes:
-        path: the record's file.
         command: the command that wrote it: run, finetune, compare or profile.
         data: the command's --json output, and further data for the page.
     """

@@ -52,7 +52,6 @@ class SidecarInfo:
         model_sha256: digest of the model file it belongs to.
         adapter: name of the adapter that wrote it, "" when written without a host.
         host_commit: the host checkout's commit, "" when unknown.
-        settings: of the fine-tuning.
     """
 
     rows: int

@@ -106,11 +106,7 @@ class HostInfo:
 
 @dataclass(frozen=True)
 class ConfigFile:
-    """A configuration file (one JSON object) whose values override the host's command line.
-
-    Attributes:
-        flag: the flag that names the file.
-    """
+    """A configuration file (one JSON object) whose values override the host's command line."""
 
     flag: str
 

@@ -17,12 +17,7 @@ _SHORT = 100
 
 @dataclass(frozen=True)
 class Tried:
-    """The result of one adapter on one codebase.
-
-    Attributes:
-        adapter: the adapter.
-        match: the result of its fingerprint and its seams.
-    """
+    """The result of one adapter on one codebase."""
 
     adapter: HostAdapter
     match: Match

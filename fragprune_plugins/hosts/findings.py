@@ -42,7 +42,6 @@ class SeamState:
     """The state of a seam in the source.
 
     Attributes:
-        seam: the seam.
         status: "at import" where the source cannot tell, because the module is compiled.
         at: "file:line" of the function, or of the place where it was expected; "" at import.
         finding: the error, where there is one.

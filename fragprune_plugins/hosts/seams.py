@@ -130,12 +130,8 @@ class SeamCall:
     """A call of the host's function at a seam.
 
     Attributes:
-        seam: the seam.
         function: the host's own.
         instance: what the method was called on; None for a function.
-        args: as passed.
-        kwargs: as passed.
-        model: the model of the call.
         result: what the host's function returned; None until it was called.
     """
 

@@ -25,7 +25,6 @@ class HostCommand:
     """The parts of a host's command. The host itself parses all of its flags.
 
     Attributes:
-        script: the script to run.
         arguments: the script's arguments, unchanged.
         flags: values of the flags that fragprune reads, by field of ``CommandLine``.
         line: the host's spellings of these flags.

@@ -40,7 +40,6 @@ class Start(NamedTuple):
 
     Attributes:
         iteration: the host's iteration that wrote the file.
-        path: the file, a checkpoint or a PLY.
         why: the reason for this file, for a log line.
     """
 

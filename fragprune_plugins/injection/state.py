@@ -43,7 +43,6 @@ class ModelState:
     """A model's thresholds and the state of its training.
 
     Attributes:
-        store: the thresholds.
         stage: learns the thresholds; None if thresholds of a sidecar only apply.
         steps: number of the host's steps since the session saw the model.
         begun: a step has begun, and its loss has not gone backward.
@@ -52,8 +51,6 @@ class ModelState:
         views: by view, a function that draws the view again, from its last visit.
         seen: views that were drawn to learn from, in the order of their first visits.
         loaded: the means with which a sidecar's thresholds were loaded.
-        hooked: the optimizers that carry our hooks.
-        hooks: handles that remove these hooks.
         stepped: value of ``steps`` at the last step of the store.
         pictured: what was drawn to learn from in this step: (``steps``, view, part).
         lent: per running optimizer step, (param group, the host's options) to restore.

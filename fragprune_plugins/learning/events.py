@@ -13,8 +13,6 @@ class PopulationChange:
 
     Attributes:
         operation: of the store or of the host, such as "keep" or "training_setup".
-        before: rows before the change.
-        after: rows after it.
     """
 
     operation: str
@@ -46,14 +44,11 @@ class Summary:
     """Result of a session on the training views that it drew.
 
     Attributes:
-        adapter: name of the adapter.
-        engine: name of the engine.
         steps: number of steps that learned.
         gaussians: in the trained model.
         fragments_before: per pixel, untruncated with the opacities at each view's first visit.
         fragments_after: per pixel, as drawn at each view's last visit.
         target_reached: within 5% of the target speed-up; None without one.
-        settings: of the fine-tuning.
     """
 
     adapter: str

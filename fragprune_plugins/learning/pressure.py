@@ -73,11 +73,7 @@ class PressureRule(Protocol):
 
 @dataclass
 class FixedPressure:
-    """Keeps lambda the same in all steps.
-
-    Attributes:
-        value: lambda.
-    """
+    """Keeps lambda the same in all steps."""
 
     value: float
 
@@ -128,9 +124,6 @@ class StepViews:
     Such a host divides each view's loss by their number, so the pressure must be their mean as
     well. Their number is known only at the end of a step, so the number of the step before is used,
     and one in the first step. Figures may be scalars on a device; reading them waits for it.
-
-    Attributes:
-        expected: views a step.
     """
 
     expected: int = 1

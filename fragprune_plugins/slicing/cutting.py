@@ -251,8 +251,6 @@ class _Cut:
 
     Attributes:
         kernels: the engine's compiled functions.
-        splats: the engine's input.
-        moment: the engine's input.
         arrays: the tensors that compiled code reads.
     """
 

@@ -35,7 +35,6 @@ class Ranks:
 
     Attributes:
         rank: of this process, from 0.
-        size: number of processes.
     """
 
     rank: int = 0

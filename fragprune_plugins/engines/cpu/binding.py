@@ -169,7 +169,6 @@ class Library:
 
     Attributes:
         build: baseline, avx2 or avx512.
-        path: the shared library's file.
         lanes: pixels that one instruction handles.
         calls: its C functions, as ctypes objects.
     """

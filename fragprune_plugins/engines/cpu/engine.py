@@ -54,9 +54,6 @@ class _Drawing:
     """One forward pass: its non-differentiable inputs, and the data that it leaves for backward.
 
     Attributes:
-        inputs: the engine's input.
-        library: the build in use.
-        workspace: the engine's reusable memory.
         arrays: the tensors that C code reads; they live as long as its state.
         state: the data that backward needs; None if no gradients are needed.
         evaluated: (Gaussian, pixel) lanes that were computed.
@@ -197,7 +194,6 @@ class CpuEngine:
         library: the build to use; None for the best one on this machine.
 
     Attributes:
-        library: the build in use.
         workspace: its reusable memory.
         sh_apart: it reads ``Splats.sh_rest``, so that nobody needs to join the coefficients.
     """

@@ -303,7 +303,6 @@ class Drawing:
     drawing. A reference back would be a cycle through C++, which no garbage collector finds.
 
     Attributes:
-        where: the device that it runs on.
         evaluated: (Gaussian, pixel) lanes that were computed; NaN until read.
         entries: (Gaussian, tile) pairs in the lists; NaN until read.
     """

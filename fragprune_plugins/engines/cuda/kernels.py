@@ -63,7 +63,6 @@ class Nvrtc:
     """The run-time compiler, a shared library.
 
     Attributes:
-        name: nvrtc.
         version: of the toolkit.
         architectures: compute capabilities for which it makes machine code, ascending.
 

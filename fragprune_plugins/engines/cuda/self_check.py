@@ -41,7 +41,6 @@ class Verdict:
     Attributes:
         outcome: "fails" when the engine draws something else, crashes or never returns; "could not
             run" when the GPU had no room, no time or no kernels for the check.
-        reason: for people.
     """
 
     outcome: Literal["agrees", "fails", "could not run"]

@@ -25,7 +25,6 @@ class Case:
     """An adapter and the host to test it on.
 
     Attributes:
-        adapter: under test.
         driver: how the host is driven.
         root: the folder of a miniature, of a checkout or of installed packages; it is only read.
         examples: sequences of actions to try.

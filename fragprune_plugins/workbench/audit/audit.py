@@ -189,7 +189,6 @@ class Shown:
     """A view whose pictures are kept.
 
     Attributes:
-        name: of the view.
         image: (3, H, W).
         fragments: (H, W) drawn per pixel.
         overdraw: (H, W) ellipses of sqrt(8) standard deviations over each pixel.
@@ -239,12 +238,7 @@ def audit(
 
 
 class _Survey:
-    """An audit under way.
-
-    Attributes:
-        candidates: the model and its cuts, by name.
-        shown: the views that pictures show.
-    """
+    """An audit under way."""
 
     def __init__(self, model: Model, engine: Engine) -> None:
         self._model, self._engine, self._splats = model, engine, model.splats()

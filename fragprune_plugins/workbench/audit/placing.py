@@ -49,9 +49,7 @@ class Placed:
     """Cameras that were placed, and why there.
 
     Attributes:
-        views: the cameras.
         side: "orbit" or "inside".
-        why: a sentence.
         enclosed: share of directions that end on a surface, from the best place; NaN if no place
             was looked for.
     """

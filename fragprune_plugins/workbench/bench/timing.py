@@ -23,7 +23,6 @@ class Case:
     """A rasterization to time.
 
     Attributes:
-        scene: the scene's name.
         view: the camera, on the Gaussians' device.
         splats: activated Gaussians; their device does the work.
         kind: forward only, or with every gradient.

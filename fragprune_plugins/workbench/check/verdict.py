@@ -24,7 +24,6 @@ class Verdict:
     Attributes:
         kind: "fits" (an adapter does), "several" (of them do), "inside" (one fits a folder of it),
             "finetune" (none does, but its PLY is plain 3DGS) or "never".
-        sentence: the answer for people.
         reason: what speaks against the better answer; "" if nothing does.
         adapter: name of the adapter that fits, or of the nearest; "" if none finds a seam.
         differs: the differences from the nearest adapter's host.

@@ -22,7 +22,6 @@ class Alone:
     """At most one of some options is given.
 
     Attributes:
-        names: of the options.
         expected: what an error says was expected.
     """
 
@@ -42,7 +41,6 @@ class Needs:
     """An option is given only with another one.
 
     Attributes:
-        name: of the option.
         others: one of these must be given.
         expected: what an error says was expected.
     """

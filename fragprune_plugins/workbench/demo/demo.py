@@ -47,8 +47,6 @@ class DemoSettings:
         iterations: number of iterations of the host's own training.
         finetune: number of iterations of stage 2.
         pressure: weight of drawn fragments per pixel; None for the default.
-        seed: seed of the training.
-        engine: name of the engine that rasterizes.
         device: "cpu" or a CUDA device.
         views, width, points: of the scene, as ``make_scene`` takes them.
     """

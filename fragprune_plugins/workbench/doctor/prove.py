@@ -62,8 +62,6 @@ class Contestant:
     """Who is to be proved.
 
     Attributes:
-        name: for people.
-        engine: draws.
         ours: it knows thresholds, and must equal the oracle in everything.
     """
 

@@ -20,7 +20,6 @@ class Extent:
     """A rule for the radius of an ellipse, in standard deviations.
 
     Attributes:
-        name: of the rule, for people.
         sigmas: the largest radius.
         alpha: an ellipse ends where its alpha falls below this; 0 for however faint.
     """
@@ -56,7 +55,6 @@ class Viewer:
     """How some viewers draw a Gaussian.
 
     Attributes:
-        names: of the viewers.
         extent: the ellipse that they fill.
         shape: what they rasterize for it: a "quad" around its axes, the tiles of a "square" of the
             longer axis, or those of its bounding "box".

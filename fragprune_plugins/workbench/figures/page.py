@@ -30,7 +30,6 @@ class Table:
     """A table whose first columns are words and whose others are numbers.
 
     Attributes:
-        head: names of the columns.
         rows: cells as they are to be read, as many as the head has.
         caption: below the table.
         words: how many columns are words.

@@ -19,7 +19,6 @@ class Recorded:
     """The "photographs" of a record.
 
     Attributes:
-        photographs: the scene.
         models: the model before and the model after; joint learning leaves the latter alone.
         filtered: whether the models may be such as only their host's rules draw; see ``read_ply``.
         drawing: fields of ``RasterInputs`` that differ from vanilla's rules.

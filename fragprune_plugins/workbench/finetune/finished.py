@@ -39,17 +39,13 @@ class Finetuned:
     """A fine-tuning that is over.
 
     Attributes:
-        model: the file that came in.
-        out: the file that was written.
         start: the model as it came in.
-        result: what was learned.
         saved: the model in ``out``: of all processes, where they divided it.
         itself: the share of training views that are the model's own pictures; None for none.
         keep: the share of Gaussians to learn with, or how to choose it; None for all.
         removed: Gaussians that went before learning.
         found: what a search for the strongest truncation found; None without one.
         dropped: counts of Gaussians that went at the end; None where that was not asked.
-        seed: of the order of views.
         truncated: the result has thresholds, here or in another process.
         shards: processes that hold a part of the Gaussians each; 1 where each holds them all.
     """

@@ -124,8 +124,6 @@ class Training:
     Attributes:
         model: as it is now; what trains has gradients.
         rates: initial learning rates of the parameters that train, by name.
-        optimizer: theirs.
-        stage: the thresholds' learning.
         curves: one point for each step.
         done: steps.
         between: no step is under way.

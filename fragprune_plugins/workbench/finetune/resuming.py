@@ -112,9 +112,6 @@ class Checkpoints:
 class Keeper:
     """Takes a training over from its checkpoint, and writes the next ones.
 
-    Attributes:
-        checkpoints: those that this process writes.
-
     Raises:
         CheckpointError: the checkpoint is broken, or another fine-tuning's.
         RanksError: another process is about to learn something else.

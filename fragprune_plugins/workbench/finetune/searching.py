@@ -61,7 +61,6 @@ class Bounded:
         bound: on the loss, dB.
         result: the strongest truncation within the bound; the one that loses least where none is.
         trial: its figures; None if the search was interrupted before they were taken.
-        control: the control's result.
         trials: all of them, in order.
     """
 
@@ -130,8 +129,6 @@ class _Search:
 
     Attributes:
         bound: dB.
-        say: is told what happens.
-        control: its result, once there is one.
         last: the training that ended last.
         pressure: of the next training; None for the default one.
         trials: all that were measured.

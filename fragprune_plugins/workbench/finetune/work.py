@@ -67,13 +67,9 @@ class _Opened:
     """What a fine-tuning works with.
 
     Attributes:
-        asked: the options.
         whole: the model, on ``device``; of all processes on the CPU, if they divide it.
         photographs: where they lie; None for the model's own pictures.
         dataset: the photographs or pictures.
-        engine: draws.
-        device: where it draws.
-        checkpoints: of the unfinished fine-tuning.
         configuration: what decides the result; a command of the same one is known again.
     """
 

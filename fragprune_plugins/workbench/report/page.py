@@ -43,7 +43,6 @@ class Shown:
     """A view that was drawn for a page.
 
     Attributes:
-        name: how its files begin.
         size: of its photograph: width and height, pixels.
         fragments: drawn per pixel, of each model.
     """
@@ -58,7 +57,6 @@ class Drawn:
     """Views that were drawn for a page, on shared scales.
 
     Attributes:
-        views: the views.
         target: what they were compared with: "Photograph", or the model's own picture.
         most_fragments: per pixel, at the top of the scale.
         most_error: difference to the photograph at the top of the scale, 8-bit levels.

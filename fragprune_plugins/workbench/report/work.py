@@ -223,8 +223,6 @@ class _Source:
 
     Attributes:
         models: the original and the pruned model; joint learning leaves the latter alone.
-        filtered: whether only their host's rules may draw them.
-        drawing: fields of ``RasterInputs`` that differ from vanilla's rules.
         needs: files and folders besides the models.
         dataset: opens the views, with the original and an engine.
     """

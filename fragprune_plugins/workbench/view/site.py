@@ -53,7 +53,6 @@ class Layer:
 
     Attributes:
         name: what the page calls it.
-        model: which of the models.
         truncated: whether its thresholds apply.
     """
 
@@ -68,7 +67,6 @@ class Shown:
 
     Attributes:
         name: what the page calls it.
-        view: the camera.
         photograph: of this camera; None where there is none.
     """
 

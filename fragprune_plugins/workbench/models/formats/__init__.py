@@ -30,7 +30,6 @@ class Format:
     """A file format of models.
 
     Attributes:
-        name: for messages.
         suffix: the end of a file's name.
         read: gives the model of an open file.
         write: writes a model on the CPU into an open file; ValueError says what the format cannot
