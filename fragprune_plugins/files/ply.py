@@ -29,7 +29,6 @@ from fragprune_plugins.files.model import REST_COUNTS, Model
 from fragprune_plugins.files.ply_table import HEADER_MAX, Columns, header_lines, read_vertices
 from fragprune_plugins.files.reading import Door, Reading
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.types import is_rim, is_stop
 
 THRESHOLD_COLUMN = "trunc_threshold"
 
@@ -104,13 +103,7 @@ def _rules_in(reading: Reading) -> dict[str, Any]:
         for name, words in (("stop", STOP), ("rim", RIM)):
             if line.startswith(begin := f"comment {words} ".encode()) and name not in rules:
                 rules[name] = line.removeprefix(begin).strip().decode()
-    if "stop" in rules:
-        rules["stop"] = float(rules["stop"])
-        if not is_stop(rules["stop"]):
-            raise ValueError(f"a stop of {rules['stop']:g}, which is 1e-4 to 1")
-    if "rim" in rules and not is_rim(rules["rim"]):
-        raise ValueError(f"a rim {rules['rim']!r:.40}, which is hard or soft")
-    return rules
+    return rules | ({"stop": float(rules["stop"])} if "stop" in rules else {})
 
 
 def _splat(path: Path, columns: Columns, filtered: bool) -> Model:
@@ -268,11 +261,11 @@ def read_thresholds(path: Path) -> ThresholdStore | None:
         rules = _rules_in(reading)
         reading.file.seek(0)
         columns = read_vertices(reading)
-    if (values := columns.get(THRESHOLD_COLUMN)) is None:
-        store = ThresholdStore(len(next(iter(columns.values()))))
-    else:
-        store = _store_of(path, torch.from_numpy(values.astype(np.float32)))
-    return store.ruled(**rules)
+        if (values := columns.get(THRESHOLD_COLUMN)) is None:
+            store = ThresholdStore(len(next(iter(columns.values()))))
+        else:
+            store = _store_of(path, torch.from_numpy(values.astype(np.float32)))
+        return store.ruled(**rules)
 
 
 def _require_finite(path: Path, names: tuple[str, ...], data: np.ndarray[Any, Any]) -> None:

@@ -64,7 +64,7 @@ def missing_imports(
     found: dict[str, Missing] = {}
     for script in scripts:
         for name, at in _foreign(repo, script, provided):
-            if not _present(name) and not _inside(repo, name):
+            if not present(name) and not _inside(repo, name):
                 found.setdefault(name, Missing(name, at))
     return list(found.values())
 
@@ -137,14 +137,9 @@ def _imports(body: list[ast.stmt], main: bool) -> Iterator[ast.Import | ast.Impo
 
 def _is_main(node: ast.stmt) -> TypeGuard[ast.If]:
     """Whether a test is ``__name__ == "__main__"``, in either order."""
-    return (
-        isinstance(node, ast.If)
-        and isinstance(node.test, ast.Compare)
-        and any(
-            isinstance(side, ast.Name) and side.id == "__name__"
-            for side in (node.test.left, *node.test.comparators)
-        )
-    )
+    if not (isinstance(node, ast.If) and isinstance(node.test, ast.Compare)):
+        return False
+    return "__name__" in map(ast.unparse, (node.test.left, *node.test.comparators))
 
 
 def _own(roots: list[HostRepo], name: str) -> list[Module]:
@@ -168,9 +163,9 @@ def _inside(repo: HostRepo, package: str) -> bool:
         return False
 
 
-def _present(package: str) -> bool:
+def present(package: str) -> bool:
     """Whether an import would find a package here."""
     try:
         return find_spec(package) is not None
-    except ValueError:  # a module without a spec, put there by hand
+    except ValueError:  # a module without a spec, a stand-in of another tool
         return True

@@ -13,9 +13,16 @@ from pathlib import Path
 from typing import Any, NoReturn
 from unittest import mock
 
+import numpy as np
+import torch
+from PIL import Image
+
+from fragprune_plugins.engines import device_for
+from fragprune_plugins.engines.cpu.memory import keep_freed_memory
 from fragprune_plugins.errors import FragpruneError, HostFailed
 from fragprune_plugins.hosts import preflight
 from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.injection.cpu_only import cpu_only
 
 _OURS = Path(__file__).parents[1]
 
@@ -72,9 +79,6 @@ def host_process(
 @contextlib.contextmanager
 def surroundings(device: str) -> Iterator[None]:
     """Inside, torch and Pillow do what hosts expect of them on this device."""
-    from fragprune_plugins.engines.cpu.memory import keep_freed_memory
-    from fragprune_plugins.injection.cpu_only import cpu_only
-
     with (
         host_checkpoints(),
         _host_pictures(),
@@ -144,10 +148,6 @@ def host_device(wanted: str, engine: str) -> str:
     Raises:
         UsageError: the device does not exist.
     """
-    import torch
-
-    from fragprune_plugins.engines import device_for
-
     if wanted == "auto" and torch.cuda.is_available():
         return "cuda"
     return str(device_for(wanted, engine))
@@ -156,8 +156,6 @@ def host_device(wanted: str, engine: str) -> str:
 @contextlib.contextmanager
 def current_gpu(device: str) -> Iterator[None]:
     """Inside, "cuda" means the GPU of ``device`` ("cuda:N"), and a host cannot choose another."""
-    import torch
-
     if not device.startswith("cuda:"):
         yield
         return
@@ -168,16 +166,12 @@ def current_gpu(device: str) -> Iterator[None]:
 @contextlib.contextmanager
 def host_checkpoints() -> Iterator[None]:
     """Inside, torch's safe loader reads hosts' checkpoints."""
-    import torch
-
     with torch.serialization.safe_globals(checkpoint_values()):
         yield
 
 
 def checkpoint_values() -> list[Any]:
     """What torch's safe loader does not know of what hosts save: NumPy scalars."""
-    import numpy as np
-
     scalar: Any = np.float64(0).__reduce__()[0]
     return [scalar, np.dtype, *(type(np.dtype(kind)) for kind in ("f4", "f8", "i4", "i8"))]
 
@@ -198,9 +192,6 @@ def _host_pictures() -> Iterator[None]:
 
     Hosts that read Blender scenes pass them.
     """
-    import numpy as np
-    from PIL import Image
-
     fromarray = Image.fromarray
 
     def from_bytes(array: Any, mode: str | None = None) -> Any:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import torch
+
 from fragprune_plugins.errors import RanksError
 
 _LAUNCHERS = {"torchrun", "torch.distributed.run", "torch.distributed.launch", "accelerate"}
@@ -20,8 +22,6 @@ def expect_one() -> None:
         RanksError: torchrun or another launcher set WORLD_SIZE, or the host has initialized
             ``torch.distributed``, with more than one process.
     """
-    import torch
-
     said = os.environ.get("WORLD_SIZE", "")
     ranks, found = int(said) if said.isdigit() else 1, f"WORLD_SIZE={said} in the environment"
     if torch.distributed.is_available() and torch.distributed.is_initialized():

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,33 +34,32 @@ from fragprune_plugins.injection.starting import Start
 from fragprune_plugins.learning.events import Summary
 from fragprune_plugins.learning.interruption import Terminate, sigterm_interrupts
 from fragprune_plugins.learning.schedule import JointSchedule, Settings
+from fragprune_plugins.plugins.loading import Plugins
 
 log = logging.getLogger("fragprune")
 
 
+@dataclass
 class Stages:
     """Runs the stages of one command and keeps the figures for the summary."""
 
-    def __init__(
-        self,
-        host: HostCommand,
-        repo: HostRepo,
-        adapter: ScriptAdapter,
-        plugins: Any,
-        options: RunOptions,
-        device: str,
-        scratch: Path,
-    ) -> None:
-        self.host, self.repo, self.adapter, self.plugins = host, repo, adapter, plugins
-        self.options, self.device, self.scratch = options, device, scratch
-        self.output = host.output
-        self.around: Path | None = None  # stage 1's folder, if stage 2 has its own
-        self.start: Start | None = None  # of stage 2
-        self.before: Path | None = None
-        self.after: Path | None = None
-        self.learned: Summary | None = None
-        self.curves: list[dict[str, float]] = []
-        self.already_finished = False
+    host: HostCommand
+    repo: HostRepo
+    adapter: ScriptAdapter
+    plugins: Plugins
+    options: RunOptions
+    device: str
+    scratch: Path
+    around: Path | None = None  # stage 1's folder, if stage 2 has its own
+    start: Start | None = None  # of stage 2
+    before: Path | None = None
+    after: Path | None = None
+    learned: Summary | None = None
+    curves: list[dict[str, float]] = field(default_factory=list)
+    already_finished: bool = False
+
+    def __post_init__(self) -> None:
+        self.output = self.host.output
 
     def observe(self) -> None:
         """Run the command unchanged; thresholds of sidecars apply, and nothing learns."""

@@ -11,24 +11,22 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import torch
+
 from fragprune_plugins.errors import LateImportError
 from fragprune_plugins.hosts.dialect import Dialect, HostCall
+from fragprune_plugins.hosts.preflight import present
 
 log = logging.getLogger("fragprune")
 
 
 def runs_here(dialect: Dialect, package: str) -> bool:
     """Whether the host can import and run its own compiled modules of a package here."""
-    from torch.cuda import is_available
-
     names = dialect.names()
     own = package not in names and any(name.startswith(f"{package}.") for name in names)
     if own and dialect.own_kernels:  # the host's folder need not be on the path yet
-        return is_available() and (dialect.own_kernels != "compiler" or _compiles())
-    try:
-        return find_spec(package) is not None
-    except ValueError:  # a module without a spec is another tool's stand-in
-        return True
+        return torch.cuda.is_available() and (dialect.own_kernels != "compiler" or _compiles())
+    return present(package)
 
 
 def _compiles() -> bool:

@@ -9,8 +9,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import torch
+
 from fragprune_plugins.errors import ModelFileError, UsageError
+from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.atomic import replacing
+from fragprune_plugins.files.ply import read_thresholds
 from fragprune_plugins.files.reading import Door
 from fragprune_plugins.hosts.adapter import (
     CHECKPOINT_KEY,
@@ -160,9 +164,6 @@ def resumable(adapter: ScriptAdapter, line: CommandLine, start: Start) -> Iterat
 
 def _learned(path: Path) -> bool:
     """Whether stage 2 or a control wrote the file, and not stage 1."""
-    from fragprune_plugins.files import sidecar
-    from fragprune_plugins.files.ply import read_thresholds
-
     if path.suffix == ".ply":
         return sidecar.belongs(path) or read_thresholds(path) is not None
     return CHECKPOINT_KEY in optimizer_state(_read_checkpoint(path)[0], str(path))
@@ -183,8 +184,6 @@ def _iteration_of_ply(ply: Path) -> int:
 
 def _read_checkpoint(path: Path) -> tuple[Any, int]:
     """Read (capture, iteration) of a checkpoint; tensors are mapped from the file."""
-    import torch
-
     if not path.exists():
         raise UsageError(str(path), "no such file", "a checkpoint", "Check the path.")
     with _DOOR.reading(path), host_checkpoints():

@@ -146,9 +146,17 @@ class ThresholdStore:
         return {"stop": self.stop, "rim": self.rim}
 
     def ruled(self, *, stop: float | None = None, rim: Rim | None = None) -> ThresholdStore:
-        """This store, with those of the ``rules`` that are given."""
+        """This store, with those of the ``rules`` that are given.
+
+        Raises:
+            InputError: the stop is not 1e-4 to 1, or the rim neither hard nor soft.
+        """
+        if not is_stop(stop):
+            raise InputError("stop", f"{stop:g}", "1e-4 to 1", "Choose another.")
+        if rim is not None and not is_rim(rim):
+            raise InputError("rim", f"{rim!r:.40}", "hard or soft", "Choose one of the two.")
         self.stop = self.stop if stop is None else stop
-        self.rim = rim or self.rim
+        self.rim = self.rim if rim is None else rim
         return self
 
     @property

@@ -174,7 +174,7 @@ class Arena:
     """
 
     def __init__(self, where: torch.device, fill: Callable[..., Tensor], **sizes: int) -> None:
-        self._sizes, places, total = sizes, {}, 0
+        places, total = {}, 0
         for name, size in sizes.items():
             places[name] = total
             total += -(-size // 256) * 256
@@ -184,10 +184,6 @@ class Arena:
 
     def __getitem__(self, name: str) -> int:
         return self.memory.data_ptr() + self._at[name]
-
-    def places(self) -> dict[str, int | None]:
-        """The addresses of all arrays by name; None of empty ones."""
-        return {name: self[name] if size else None for name, size in self._sizes.items()}
 
     def tensor(self, name: str, count: int, dtype: torch.dtype) -> Tensor:
         """An array as a tensor."""
@@ -288,12 +284,16 @@ class Memory(NamedTuple):
         scratch: needed until the lists are made.
         kept: what backward reads.
         passes: of sorting, by tile.
+        keep: backward will come.
+        slots: each list entry has one, so that backward adds in a fixed order.
     """
 
     cleared: Arena
     scratch: Arena
     kept: Arena
     passes: int
+    keep: bool
+    slots: bool
 
 
 class Drawing:
@@ -303,6 +303,7 @@ class Drawing:
     drawing. A reference back would be a cycle through C++, which no garbage collector finds.
 
     Attributes:
+        where: the device that it runs on.
         evaluated: (Gaussian, pixel) lanes that were computed; NaN until read.
         entries: (Gaussian, tile) pairs in the lists; NaN until read.
     """
@@ -398,20 +399,34 @@ class Drawing:
             transmittance=4 * pixels * keep,
             stop=4 * pixels * keep,
         )
-        return Memory(cleared, scratch, kept, passes)
+        return Memory(cleared, scratch, kept, passes, keep, slots)
 
     def _new_frame(self, capacity: int, memory: Memory) -> Frame:
         """The kernels' arguments that are places in the memory of a frame."""
-        known = {name for name, *_ in Frame._fields_}
-        arenas = (memory.cleared, memory.scratch, memory.kept)
-        places = {name: at for arena in arenas for name, at in arena.places().items()}
+        cleared, scratch, kept = memory.cleared, memory.scratch, memory.kept
+        keep, slots = memory.keep, memory.slots
         return Frame(
             spread=address(self._spread),
             capacity=capacity,
             tiles_x=self._across,
             tiles_y=self._down,
             tile_passes=memory.passes,
-            **{name: at for name, at in places.items() if name in known},
+            counters=cleared["counters"],
+            project_words=cleared["project_words"],
+            emit_words=cleared["emit_words"],
+            depth_histogram=cleared["depth_histogram"],
+            tile_histogram=cleared["tile_histogram"],
+            ranges=cleared["ranges"],
+            brushes=kept["brushes"],
+            rects=scratch["rects"],
+            tiles=kept["tiles"],
+            first_slot=kept["first_slot"] if slots else None,
+            depth_keys=scratch["depth_keys"],
+            depth_ids=scratch["depth_ids"],
+            owners=kept["owners"] if slots else None,
+            reached=kept["reached"] if keep else None,
+            transmittance=kept["transmittance"] if keep else None,
+            stop=kept["stop"] if keep else None,
         )
 
     def _list(self, frame: Frame, memory: Memory) -> None:

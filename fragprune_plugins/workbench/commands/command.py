@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import difflib
 import json
 import os
 from collections.abc import Callable, Iterator
@@ -112,23 +111,6 @@ def work_of(package: str, **options: Any) -> Report:
         import_module(f"{package}.work"), package.rpartition(".")[2]
     )
     return work(**options)
-
-
-class Group(click.Group):
-    """Commands under one name; with --json, an unknown one is printed as JSON."""
-
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        """The command that the first word names, and the other words."""
-        words = list(args)
-        try:
-            return super().resolve_command(ctx, args)
-        except click.UsageError as error:
-            near = difflib.get_close_matches(words[0], self.list_commands(ctx))
-            meant = f"Did you mean {' or '.join(near)}?" if near else "The list: --help."
-            told = click.UsageError(f"{error.message} {meant}", error.ctx)
-            raise usage_error(told, words) from error
 
 
 def _stated(error: FragpruneError, *, as_json: bool) -> click.exceptions.Exit:

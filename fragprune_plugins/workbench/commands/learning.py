@@ -25,7 +25,7 @@ from fragprune_plugins.learning.schedule import (
     steps_of,
 )
 from fragprune_plugins.types import Rim
-from fragprune_plugins.workbench.commands.options import Number
+from fragprune_plugins.workbench.commands.options import Number, together
 from fragprune_plugins.workbench.commands.rules import Alone, apart
 from fragprune_plugins.workbench.goals import AtMost, Faster
 
@@ -186,7 +186,8 @@ def learning_options(*, every_goal: bool) -> Callable[[Callable[..., Any]], Call
             return function(*args, settings=settings, **kwargs)
 
         options = _OPTIONS + _OF_FINETUNE if every_goal else _OPTIONS
-        return functools.reduce(lambda f, option: option(f), reversed(options), with_settings)
+        decorated: Callable[..., Any] = together(*options)(with_settings)
+        return decorated
 
     return decorate
 
@@ -234,8 +235,3 @@ def _goal(
     if control:
         return Control()
     return Portable(pressure) if portable else Pressure(pressure)
-
-
-def again_option(text: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """The option ``--again``, with its help."""
-    return click.option("--again", is_flag=True, help=text)

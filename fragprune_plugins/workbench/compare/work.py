@@ -20,7 +20,7 @@ from fragprune_plugins.workbench.commands.opening import (
 )
 from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
-from fragprune_plugins.workbench.figures.panels import draw_panels
+from fragprune_plugins.workbench.figures.panels import leave_panels
 from fragprune_plugins.workbench.figures.recorded import Recorded, recorded
 from fragprune_plugins.workbench.figures.wording import (
     describe,
@@ -75,10 +75,7 @@ def compare(
     lines = _lines(measured, report, shown, shots[0].view)
     if out is not None:
         columns = dict(zip("AB", candidates, strict=True))
-        files = draw_panels(out, columns, shots, rasterizer)
-        report["files"] = [str(file) for file in files]
-        records.leave(out / "compare", "compare", report)
-        lines.append(f"Wrote {len(files)} pictures to {out}.")
+        lines.append(leave_panels(out, "compare", report, columns, shots, rasterizer))
     return Report(report, "\n".join(lines))
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from fragprune_plugins.files import records
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.hosts.photographs import Photographs
-from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.injection.launch import RunOptions, RunSummary, run
 from fragprune_plugins.learning.goals import Control, Pressure
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.workbench.demo.folder import claiming, clear
@@ -27,7 +27,6 @@ from fragprune_plugins.workbench.scenes.dataset import load_dataset
 
 if TYPE_CHECKING:
     from fragprune_plugins.files.model import Model
-    from fragprune_plugins.injection.launch import RunOptions, RunSummary
 
 HOST = Path(__file__).with_name("host") / "train.py"
 """The training script of the demo's host."""
@@ -108,12 +107,12 @@ def run_demo(
 
     settings = settings or DemoSettings()
     clear(out)
-    clock = _Clock()
+    seconds: dict[str, float] = {}
     scene, model = out / "scene", out / "model"
     with claiming(out, "scene"):
         make_scene(scene, views=settings.views, width=settings.width, points=settings.points)
     with (
-        clock.part("train"),
+        _timed(seconds, "train"),
         claiming(out, "model"),
         contextlib.redirect_stdout(sys.stderr),
     ):
@@ -123,27 +122,25 @@ def run_demo(
             f"every Gaussian for {settings.finetune}"
         )
         summary = run(command, _run_options(settings))
-    with clock.part("control"):
+    with _timed(seconds, "control"):
         say(f"2/4  The control: the same {settings.finetune} iterations without cutoffs")
         control = _control(scene, summary, settings)
-    with clock.part("measure"):
+    with _timed(seconds, "measure"):
         say("3/4  Measuring on the held-out views")
         report = _measure(scene, summary, control, settings)
-    with clock.part("pictures"), claiming(out, "pictures", "index.html", "model"):
+    with _timed(seconds, "pictures"), claiming(out, "pictures", "index.html", "model"):
         say("4/4  Drawing the pictures")
         report["files"] = write_page(
             out, report, scene, summary.curves, settings.engine, settings.device
         )
         _record(report, scene, summary)
-    report["seconds_by_part"] = clock.seconds
-    report["seconds"] = sum(clock.seconds.values())
+    report |= {"seconds_by_part": seconds, "seconds": sum(seconds.values())}
     with claiming(out, REPORT), replacing(out / REPORT) as path:
         path.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     return report
 
 
 def _run_options(settings: DemoSettings) -> RunOptions:
-
     learning = Settings(
         iterations=settings.finetune, goal=Pressure(settings.pressure), seed=settings.seed
     )
@@ -151,7 +148,6 @@ def _run_options(settings: DemoSettings) -> RunOptions:
 
 
 def _control(scene: Path, summary: RunSummary, settings: DemoSettings) -> Model:
-
     assert summary.model_before is not None  # the host saves at its last iteration
     model = models.load(summary.model_before, device=settings.device)
     learning = Settings(iterations=settings.finetune, goal=Control(), seed=settings.seed)
@@ -162,7 +158,6 @@ def _control(scene: Path, summary: RunSummary, settings: DemoSettings) -> Model:
 def _measure(
     scene: Path, summary: RunSummary, control: Model, settings: DemoSettings
 ) -> dict[str, Any]:
-
     assert summary.model_before is not None
     assert summary.model_after is not None
     candidates = [
@@ -207,15 +202,9 @@ def _record(report: dict[str, Any], scene: Path, summary: RunSummary) -> None:
     records.leave(summary.model_after, "run", report | more)
 
 
-class _Clock:
-    """Measures wall time; ``seconds`` holds the seconds of each part by name."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-
-    @contextlib.contextmanager
-    def part(self, name: str) -> Iterator[None]:
-        """Time the block as the part of this name."""
-        started = time.perf_counter()
-        yield
-        self.seconds[name] = round(time.perf_counter() - started, 3)
+@contextlib.contextmanager
+def _timed(seconds: dict[str, float], part: str) -> Iterator[None]:
+    """Add the wall time of a block, as that of a part."""
+    started = time.perf_counter()
+    yield
+    seconds[part] = round(time.perf_counter() - started, 3)

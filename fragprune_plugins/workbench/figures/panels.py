@@ -4,16 +4,36 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from fragprune_plugins.engines import Engine
+from fragprune_plugins.files import records
 from fragprune_plugins.learning.stage2 import evenly
 from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.figures.pictures import save_panel, stems
 from fragprune_plugins.workbench.scenes.dataset import Shot
 
 PANELS = 4
+
+
+def leave_panels(
+    out: Path,
+    command: str,
+    report: dict[str, Any],
+    columns: dict[str, Candidate],
+    shots: Sequence[Shot],
+    engine: Engine,
+) -> str:
+    """Draw views into a folder, and leave a command's record there; returns a line that says so.
+
+    The record is the report with ``files``, the names of the pictures, which is added.
+    """
+    files = draw_panels(out, columns, shots, engine)
+    report["files"] = [str(file) for file in files]
+    records.leave(out / command, command, report)
+    return f"Wrote {len(files)} pictures to {out}."
 
 
 def draw_panels(

@@ -15,7 +15,6 @@ from fragprune_plugins.workbench.commands.command import (
 from fragprune_plugins.workbench.commands.config import config_option
 from fragprune_plugins.workbench.commands.learning import (
     LEARNING_APART,
-    again_option,
     learning_options,
 )
 from fragprune_plugins.workbench.commands.logs import log_option
@@ -141,7 +140,9 @@ RULES = (
     is_flag=True,
     help="Leave out Gaussians that reach no pixel of any training or held-out view.",
 )
-@again_option("Begin anew, though OUT is finished or there is a checkpoint.")
+@click.option(
+    "--again", is_flag=True, help="Begin anew, though OUT is finished or there is a checkpoint."
+)
 @engine_options()
 @first_process_prints()
 def command(**options: Any) -> Report | None:

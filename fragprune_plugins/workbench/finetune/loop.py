@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import random
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import islice
@@ -28,7 +29,6 @@ from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.hooks import thresholds_for
 from fragprune_plugins.plugins.loading import installed
 from fragprune_plugins.types import RasterInputs, RasterOutputs
-from fragprune_plugins.workbench.finetune.order import order
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 
 # Learning rates at the start of stage 2, the hosts' own; all decay with the opacity's. Positions
@@ -287,3 +287,22 @@ class Training:
     def _plain(self, inputs: RasterInputs) -> RasterOutputs:
         """Draw without thresholds and stop."""
         return self.engine.rasterize(replace(inputs, stop=None), None)
+
+
+def order(
+    views: Sequence[Shot], steps: int, views_per_step: int, seed: int
+) -> Iterator[Sequence[Shot]]:
+    """For each step its views, from permutations of all of them, one after the other.
+
+    The global random streams are not touched.
+    """
+    stream = random.Random(seed)
+    queue: list[Shot] = []
+    for _ in range(steps):
+        chosen: list[Shot] = []
+        for _ in range(views_per_step):
+            if not queue:
+                queue = list(views)
+                stream.shuffle(queue)
+            chosen.append(queue.pop())
+        yield chosen

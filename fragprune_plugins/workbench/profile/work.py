@@ -7,7 +7,6 @@ from typing import Any
 
 import torch
 
-from fragprune_plugins.files import records
 from fragprune_plugins.files.atomic import writable_folder
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import (
@@ -18,7 +17,7 @@ from fragprune_plugins.workbench.commands.opening import (
 )
 from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
-from fragprune_plugins.workbench.figures.panels import draw_panels
+from fragprune_plugins.workbench.figures.panels import leave_panels
 from fragprune_plugins.workbench.figures.wording import describe, nothing_drawn
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
@@ -73,8 +72,5 @@ def profile(
             + ", ".join(f"{value:.3f}" for value in quantiles)
         )
     if out is not None:
-        files = draw_panels(out, columns, shots, rasterizer)
-        report["files"] = [str(file) for file in files]
-        records.leave(out / "profile", "profile", report)
-        lines.append(f"Wrote {len(files)} pictures to {out}.")
+        lines.append(leave_panels(out, "profile", report, columns, shots, rasterizer))
     return Report(report, "\n".join(lines))

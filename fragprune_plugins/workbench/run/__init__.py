@@ -10,7 +10,6 @@ from fragprune_plugins.workbench.commands.command import Command, Report, work_o
 from fragprune_plugins.workbench.commands.config import config_option
 from fragprune_plugins.workbench.commands.learning import (
     LEARNING_APART,
-    again_option,
     learning_options,
 )
 from fragprune_plugins.workbench.commands.logs import log_option
@@ -57,7 +56,7 @@ RULES = (
     help="Go on where the host's own rasterizer draws otherwise than ours. What nobody proved is "
     "named on stderr.",
 )
-@again_option("Train, or learn, anew, though that is finished.")
+@click.option("--again", is_flag=True, help="Train, or learn, anew, though that is finished.")
 def command(**options: Any) -> Report:
     """Train with a host's own command, then learn a cutoff for every Gaussian.
 

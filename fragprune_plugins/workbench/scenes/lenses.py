@@ -66,9 +66,7 @@ class Lens:
             DatasetError: the lens has distortion, and OpenCV is not installed.
             InputError: the numbers are not plausible.
         """
-        own = Camera(
-            rotation, translation, self.width, self.height, self.fx, self.fy, self.cx, self.cy
-        )
+        own = self._camera(rotation, translation)
         if self.straight:
             return own
         cv2, size = _opencv(), (self.width, self.height)
@@ -82,6 +80,11 @@ class Lens:
         fx, fy, cx, cy = (float(found[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
         return Camera(rotation, translation, *size, fx, fy, cx + 0.5, cy + 0.5)
 
+    def _camera(self, rotation: Tensor, translation: Tensor) -> Camera:
+        """The camera of the photograph itself, without its distortion."""
+        numbers = (self.width, self.height, self.fx, self.fy, self.cx, self.cy)
+        return Camera(rotation, translation, *numbers)
+
     def straighten(self, pixels: Pixels, camera: Camera) -> Pixels:
         """A photograph as the pinhole ``camera`` sees it.
 
@@ -92,16 +95,7 @@ class Lens:
         cv2 = _opencv()
         height, width = pixels.shape[:2]
         seen = _matrix(camera.resized(width, height))
-        here = Camera(
-            camera.rotation,
-            camera.translation,
-            self.width,
-            self.height,
-            self.fx,
-            self.fy,
-            self.cx,
-            self.cy,
-        ).resized(width, height)
+        here = self._camera(camera.rotation, camera.translation).resized(width, height)
         make = cv2.fisheye.initUndistortRectifyMap if self.fisheye else cv2.initUndistortRectifyMap
         bend, size = np.array(self.coefficients), (width, height)
         maps = make(_matrix(here), bend, np.eye(3), seen, size, cv2.CV_32FC1)

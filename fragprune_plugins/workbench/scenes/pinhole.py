@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -47,15 +47,14 @@ class Camera:
     def resized(self, width: int, height: int) -> Camera:
         """The same camera with another number of pixels."""
         x, y = width / self.width, height / self.height
-        return Camera(
-            self.rotation,
-            self.translation,
-            width,
-            height,
-            self.fx * x,
-            self.fy * y,
-            self.cx * x,
-            self.cy * y,
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * x,
+            fy=self.fy * y,
+            cx=self.cx * x,
+            cy=self.cy * y,
         )
 
     def view(self, background: Tensor | None = None) -> View:
@@ -70,11 +69,8 @@ class Camera:
             cx=self.cx,
             cy=self.cy,
         )
-        return View(
-            width=exact.width,
-            height=exact.height,
-            tan_fov_x=exact.tan_fov_x,
-            tan_fov_y=exact.tan_fov_y,
+        return replace(
+            exact,
             viewmatrix=exact.viewmatrix.float(),
             projmatrix=exact.projmatrix.float(),
             campos=exact.campos.float(),

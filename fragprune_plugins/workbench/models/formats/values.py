@@ -14,7 +14,7 @@ from fragprune_plugins.constants import NEUTRAL_LOGIT
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.reading import MEBIBYTE
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.types import Rim, is_rim, is_stop
+from fragprune_plugins.types import Rim
 from fragprune_plugins.workbench.models import cutoffs
 
 Floats = npt.NDArray[np.float32]
@@ -57,16 +57,13 @@ def splat_of(
         rim: as in ``RasterInputs``.
 
     Raises:
-        ValueError: there are no Gaussians, or thresholds, the stop or the rim are out of range.
+        ValueError: there are no Gaussians, or thresholds out of range.
+        InputError: the stop or the rim is out of range.
     """
     if not len(xyz):
         raise ValueError("0 Gaussians")
     if thresholds is not None and not ((thresholds > 0) & (thresholds < 1)).all():
         raise ValueError("thresholds outside (0, 1)")
-    if not is_stop(stop):
-        raise ValueError(f"a stop of {stop}, which is 1e-4 to 1")
-    if not is_rim(rim):
-        raise ValueError(f"a rim {rim!r:.40}, which is hard or soft")
     inside = np.clip(np.asarray(opacities, np.float64), _ALPHA_EDGE, 1 - _ALPHA_EDGE)
     rotations = np.array(rotations, np.float32)
     rotations[(rotations == 0).all(axis=1), 0] = 1
