@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import io
 import os
 import sys
@@ -12,14 +11,14 @@ import click
 
 from fragprune_plugins.errors import PluginError
 from fragprune_plugins.plugins.points import load, offered
-from fragprune_plugins.workbench.commands.command import Command, usage_error
+from fragprune_plugins.workbench.commands.command import Command, Group
 
 GROUP = "fragprune.commands"
 """The entry-point group of commands: a click command each, ours and those of other packages."""
 
 
-class _Commands(click.Group):
-    """Commands by entry point, imported on use; with --json, an unknown one is printed as JSON."""
+class _Commands(Group):
+    """Commands by entry point, imported on use."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(offered(GROUP))
@@ -33,19 +32,6 @@ class _Commands(click.Group):
         except PluginError as error:
             return _broken(cmd_name, error)
         return command
-
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        """The command that the first word names, and the other words."""
-        words = list(args)
-        try:
-            return super().resolve_command(ctx, args)
-        except click.UsageError as error:
-            near = difflib.get_close_matches(words[0], self.list_commands(ctx))
-            meant = f"Did you mean {' or '.join(near)}?" if near else "The list: --help."
-            told = click.UsageError(f"{error.message} {meant}", error.ctx)
-            raise usage_error(told, words) from error
 
 
 def _broken(name: str, error: PluginError) -> click.Command:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import difflib
 import json
 import os
 from collections.abc import Callable, Iterator
@@ -55,6 +56,8 @@ class Command(click.Command):
 
     Args:
         rules: which of its options exclude or need each other; checked before anything is done.
+        args: of click's class, as ``kwargs``.
+        kwargs: likewise.
     """
 
     def __init__(self, *args: Any, rules: Rules = (), **kwargs: Any) -> None:
@@ -113,6 +116,23 @@ def work_of(package: str, **options: Any) -> Report:
     return work(**options)
 
 
+class Group(click.Group):
+    """Commands under one name; with --json, an unknown one is printed as JSON."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """The command that the first word names, and the other words."""
+        words = list(args)
+        try:
+            return super().resolve_command(ctx, args)
+        except click.UsageError as error:
+            near = difflib.get_close_matches(words[0], self.list_commands(ctx))
+            meant = f"Did you mean {' or '.join(near)}?" if near else "The list: --help."
+            told = click.UsageError(f"{error.message} {meant}", error.ctx)
+            raise usage_error(told, words) from error
+
+
 def _stated(error: FragpruneError, *, as_json: bool) -> click.exceptions.Exit:
     """Print an error, as JSON on stdout if asked for; returns the exit with its code."""
     if speaks():
@@ -159,6 +179,7 @@ def usage_error(error: click.UsageError, words: list[str]) -> Exception:
     """The exception to raise for a usage error. With --json, prints the error and returns an exit.
 
     Args:
+        error: click's error.
         words: words of the command line. Words after ``--`` belong to the host's command.
     """
     if not speaks():
