@@ -14,7 +14,7 @@ from typing import Any
 import fragprune_graphdeco as graphdeco
 from fragprune_3dgs_fork import ForkAdapter
 from fragprune_3dgs_fork.fork import STATISTICS, read_fork
-from fragprune_graphdeco import GraphdecoAdapter, RasterizerCall
+from fragprune_graphdeco import GraphdecoAdapter, RasterizerCall, reading
 from fragprune_plugins.adapting import (
     Door,
     Finding,
@@ -61,8 +61,9 @@ class Vanilla3DGS(GraphdecoAdapter):
     def _further(self, repo: HostRepo) -> list[Finding]:
         """What a fork of this interface does otherwise: ``3dgs-fork`` serves it, or nobody does."""
         fork = read_fork(repo)
-        if not fork.scripts:
-            return []
+        if not fork.scripts:  # another model is trained, or no file of that name is Python
+            trains = repo.tree("train") is None or reading.training_scripts(repo, "*train*.py")
+            return fork.errors if trains else []
         held = (seam for seam in self.seams if seam.role is Role.STILL)
         known = {seam.attribute.rpartition(".")[2] for seam in held} | STATISTICS
         what = [f"{name}: {fork.unserved[name]}" for name in self.scripts if name in fork.unserved]

@@ -74,6 +74,12 @@ OTHERWISE = {
         "gaussians._xyz = merged; gaussians.optimizer.step()",
         "changes _xyz outside the model's methods",
     ),
+    "trains another model": (
+        "gaussians = GaussianModel(",
+        "gaussians = OtherModel(",
+        "train.py makes OtherModel",
+    ),
+    "is no Python": ("loss.backward()", "loss.backward(", "no script that trains"),
     "steps twice": ("loss.backward()", "loss.backward(); more.backward()", "2 places that go back"),
 }
 
