@@ -164,7 +164,7 @@ def test_a_stop_and_a_soft_rim_come_back(suffix, rim, truncated, tmp_path):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ((b"rim soft", b"rim wet!"), r"rim 'wet!', which is hard or soft"),
+        ((b"rim soft", b"rim wet!"), r"rim: 'wet!'; expected hard or soft"),
         *(
             ((b"stop 0.25", f"stop {stop}".encode()), r"stop|float")
             for stop in ("0", "2", "nan", "much")
