@@ -5,7 +5,7 @@ python scale.py --folder DIR [--millions 1 3 6] [--size 1920x1080 ...] [--thread
 Makes bench scenes of SH degree 3 whose Gaussians are the smaller the more they are, so that the
 fragments per pixel stay, as files in DIR. Prints a row for each: loading, saving, a frame, a step
 of `finetune` (all parameters, every Gaussian cut at a falloff of 0.06), `audit` and `view --out`.
-Seconds are processor time of all threads, which other programs disturb less than the wall's.
+Seconds are the wall clock's, so let no other program run. A command's are of its whole process.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ import PIL.Image
 import torch
 
 from fragprune_plugins.engines import create_engine
+from fragprune_plugins.engines.cpu.memory import keep_freed_memory
 from fragprune_plugins.files.ply import read_ply, write_ply
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
@@ -69,6 +70,7 @@ def frame(path: Path, size: str) -> list[float]:
 
 def step(path: Path, size: str) -> list[float]:
     """Steps of ``finetune`` after the first."""
+    keep_freed_memory()
     view, model = make_view(*sides(size)), read_ply(path)
     pixels = np.random.default_rng(0).integers(0, 256, (view.height, view.width, 3), dtype=np.uint8)
     photograph = path.with_suffix(".png")
@@ -95,10 +97,10 @@ COMMANDS = {"audit": ("--json",), "view": ("--out", "{folder}/view.html")}
 
 
 def seconds(work: Callable[[], object]) -> float:
-    """Processor time of a call."""
-    since = time.process_time()
+    """Time of a call."""
+    since = time.perf_counter()
     work()
-    return time.process_time() - since
+    return time.perf_counter() - since
 
 
 def sides(size: str) -> tuple[int, int]:
@@ -110,10 +112,12 @@ def sides(size: str) -> tuple[int, int]:
 def measured(words: list[str]) -> tuple[list[float], float]:
     """Seconds that a process prints, or took, and its peak memory in GB."""
     code = (
-        "import json, resource, subprocess, sys\n"
+        "import json, resource, subprocess, sys, time\n"
+        "since = time.perf_counter()\n"
         "done = subprocess.run(sys.argv[1:], stdout=subprocess.PIPE, check=True, text=True)\n"
-        "used = resource.getrusage(resource.RUSAGE_CHILDREN)\n"
-        "print(json.dumps([done.stdout, used.ru_utime + used.ru_stime, used.ru_maxrss]))"
+        "whole = time.perf_counter() - since\n"
+        "peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss\n"
+        "print(json.dumps([done.stdout, whole, peak]))"
     )
     told = subprocess.run(
         [sys.executable, "-c", code, *words], stdout=subprocess.PIPE, check=True, text=True

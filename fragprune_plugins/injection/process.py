@@ -86,7 +86,7 @@ def surroundings(device: str) -> Iterator[None]:
         cpu_only() if device == "cpu" else current_gpu(device),
     ):
         if device == "cpu":
-            keep_freed_memory()
+            keep_freed_memory(growing=True)
         yield
 
 

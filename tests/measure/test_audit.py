@@ -27,6 +27,7 @@ from fragprune_plugins.workbench.audit.audit import (
 from reference_renderer.composite import transmittances
 
 ENGINE = engine_for("auto", "cpu")
+SIZES = ((24, 32), (60, 40))
 
 
 def column(seed, count):
@@ -183,3 +184,11 @@ def test_a_pruned_model_is_measured_with_its_thresholds_and_without():
     others = {each["viewers"]: each["shaded_per_pixel"] for each in plain["viewers"]}
     assert pays.pop(HONOURING) < min(pays["PlayCanvas"], pays[found["viewers"][0]["viewers"]])
     assert pays == others  # who knows no thresholds pays as before
+
+
+def test_the_size_of_the_timed_frames_is_said_smallest_and_largest():
+    small, large = (replace(tiny.cameras(1)[0].view(), width=w, height=h) for w, h in SIZES)
+    for views, size in (((large, small), "24x32 to 60x40"), ((large,), "60x40")):
+        named = [(str(number), view) for number, view in enumerate(views)]
+        figures, _ = audit(tiny.random_model(5), named, engine=ENGINE, tiles=1, repeats=1)
+        assert figures["frame_size"] == size

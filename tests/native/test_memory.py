@@ -9,9 +9,10 @@ import pytest
 STEPS = """
 import ctypes, resource, sys
 from fragprune_plugins.engines.cpu.memory import keep_freed_memory
-if sys.argv[1] == "kept":
-    print(keep_freed_memory())
-libc, sizes = ctypes.CDLL(None), [20 << 20, 16 << 20, 5 << 20]
+kind, *sizes = sys.argv[1:]
+if kind != "as it is":
+    print(keep_freed_memory(growing=kind == "growing"))
+libc, sizes = ctypes.CDLL(None), [int(size) << 20 for size in sizes]
 libc.malloc.restype, libc.free.argtypes = ctypes.c_void_p, [ctypes.c_void_p]
 for step in range(9):
     if step == 4:
@@ -25,16 +26,22 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 """
 
 
-def faults(kind: str) -> int:
-    done = subprocess.run(
-        [sys.executable, "-c", STEPS, kind], capture_output=True, text=True, check=True
-    )
+def faults(kind: str, *mebibytes: int) -> int:
+    words = [sys.executable, "-c", STEPS, kind, *map(str, mebibytes)]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
     *said, count = done.stdout.split()
-    assert said == (["True"] if kind == "kept" else [])
+    assert said == ([] if kind == "as it is" else ["True"])
     return int(count)
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library")
 def test_steps_that_free_a_model_cost_no_page_faults() -> None:
-    assert faults("as it is") > 10_000
-    assert faults("kept") < 100
+    assert faults("as it is", 20, 16, 5) > 10_000
+    assert faults("growing", 20, 16, 5) < 100
+    assert faults("of one size", 20, 16, 5) < 100
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library")
+def test_blocks_of_more_than_32_mib_go_back_where_a_model_grows() -> None:
+    assert faults("growing", 40, 3) > 10_000
+    assert faults("of one size", 40, 3) < 100

@@ -232,10 +232,10 @@ def save_learning(
         median, spread = others
         medians = np.array([row["threshold_median"] for row in curves], dtype=float)
         median.plot(steps, medians, color="tab:green")
-        median.set(xlabel="step", ylabel="median threshold (falloff)", ylim=(0, None))
+        median.set(xlabel="step", ylabel="median cutoff (falloff)", ylim=(0, None))
         final = thresholds.detach().cpu().numpy()
         spread.hist(np.maximum(final, 1e-4), bins=np.geomspace(1e-4, 1, 60), color="tab:blue")
-        spread.set(xscale="log", xlabel="threshold (falloff)", ylabel="Gaussians")
+        spread.set(xscale="log", xlabel="cutoff (falloff)", ylabel="Gaussians")
     for axes in (loss, fragments, *others):
         axes.grid(alpha=0.25)
         axes.set_facecolor("none")
