@@ -37,7 +37,7 @@ _FOV, _WIDE = 50.0, 75.0  # degrees; rooms are looked at with wide lenses
 _LEVEL = 0.5  # sine of the steepest look from inside: 30 degrees
 _NEIGHBOURS = 4
 _BETWEEN = (0.1, 0.9)  # of the way; nearer to a camera is its own picture again
-_NEAR = 2  # cameras beside each photograph's
+_NEAR = 5  # cameras beside each photograph's
 _BESIDE = (-0.6, 0.6)  # of the way; visitors leave the path of the photographs on both sides
 
 
@@ -147,7 +147,7 @@ def beside(cameras: Named, count: int, *, seed: int = 0) -> Named:
 
 
 def views_near(shots: Sequence[Shot], *, seed: int = 0) -> list[View]:
-    """The views of photographs, and twice as many beside them: what a visitor may see.
+    """The views of photographs, and five beside each of them: what a visitor may see.
 
     Args:
         shots: the photographs, on one device.
