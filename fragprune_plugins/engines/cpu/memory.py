@@ -7,7 +7,7 @@ import sys
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _MMAP_MAX = -1, -3, -4  # of <malloc.h>
 _OF_ONE_SIZE = {_MMAP_MAX: 0, _TRIM_THRESHOLD: -1}
-_GROWING = {_MMAP_THRESHOLD: 32 << 20, _TRIM_THRESHOLD: 1 << 30}
+_GROWING = {_MMAP_MAX: 1 << 16, _MMAP_THRESHOLD: 32 << 20, _TRIM_THRESHOLD: 1 << 30}
 
 
 def keep_freed_memory(*, growing: bool = False) -> bool:
