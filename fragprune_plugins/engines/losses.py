@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch.autograd.function import once_differentiable
 
+from fragprune_plugins.engines.calling import address, empty, expect_ok, native_threads, plain
 from fragprune_plugins.engines.cpu import binding
-from fragprune_plugins.engines.inputs import address, empty, expect_ok, native_threads, plain
 from fragprune_plugins.errors import InputError
 from fragprune_plugins.learning import losses
 from fragprune_plugins.learning.losses import SSIM_WEIGHT

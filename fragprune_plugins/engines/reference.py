@@ -8,7 +8,7 @@ from dataclasses import fields
 from typing import TYPE_CHECKING
 
 from fragprune_plugins.constants import TILE
-from fragprune_plugins.engines.inputs import with_joined_sh
+from fragprune_plugins.engines.calling import with_joined_sh
 from fragprune_plugins.types import (
     Footprints,
     RasterInputs,

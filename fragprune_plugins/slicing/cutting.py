@@ -15,11 +15,7 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from fragprune_plugins.engines import create_engine
-from fragprune_plugins.engines.cpu import binding
-from fragprune_plugins.engines.cpu.engine import CpuEngine
-from fragprune_plugins.engines.cuda.engine import CudaEngine
-from fragprune_plugins.engines.cuda.frame import Device, blocks_of, launch
-from fragprune_plugins.engines.inputs import (
+from fragprune_plugins.engines.calling import (
     address,
     empty,
     expect_ok,
@@ -27,6 +23,10 @@ from fragprune_plugins.engines.inputs import (
     native_threads,
     plain,
 )
+from fragprune_plugins.engines.cpu import binding
+from fragprune_plugins.engines.cpu.engine import CpuEngine
+from fragprune_plugins.engines.cuda.engine import CudaEngine
+from fragprune_plugins.engines.cuda.frame import Device, blocks_of, launch
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import EngineError, InputError
 from fragprune_plugins.slicing import structs

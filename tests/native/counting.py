@@ -60,7 +60,7 @@ def counts(
         kind: of pass, one of ``WANTS``.
         library: a build's file; this installation's AVX2 build when None.
     """
-    from fragprune_plugins.engines.inputs import native_arrays, native_inputs
+    from fragprune_plugins.engines.calling import native_arrays, native_inputs
 
     wants = WANTS[kind]
     if wants and thresholds is not None:

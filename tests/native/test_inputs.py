@@ -10,8 +10,8 @@ import spacetime
 import torch
 from footprints import footprints_of
 
+from fragprune_plugins.engines.calling import address, native_arrays, native_inputs
 from fragprune_plugins.engines.cpu.engine import CpuEngine, binding
-from fragprune_plugins.engines.inputs import address, native_arrays, native_inputs
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import EngineError
 from fragprune_plugins.slicing.cutting import slice_by
@@ -92,7 +92,7 @@ CHANGES = [
 
 @pytest.mark.parametrize(("kind", "place", "name"), CHANGES)
 def test_every_field_reaches_compiled_code(kind: str, place: str, name: str) -> None:
-    """A new field fails here until engines/inputs.py hands it on, or ``NO_INPUTS`` says why not."""
+    """A new field fails here until calling.py hands it on, or ``NO_INPUTS`` says why not."""
     inputs = GIVEN[kind]
     owner = getattr(inputs, place) if place else inputs
     changed = replace(owner, **{name: other(name, getattr(owner, name))})

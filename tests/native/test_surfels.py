@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from native.test_against_oracle import GRADIENT_TOLERANCE, check_images, draw_pair
 from native.test_inputs import draw
 
+from fragprune_plugins.engines.calling import native_arrays, native_inputs
 from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.engines.cpu.engine import CpuEngine
-from fragprune_plugins.engines.inputs import native_arrays, native_inputs
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.types import RasterInputs, RasterOutputs
 

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch.autograd.function import once_differentiable
 
-from fragprune_plugins.engines.cpu import binding
-from fragprune_plugins.engines.inputs import (
+from fragprune_plugins.engines.calling import (
     address,
     empty,
     expect_ok,
@@ -20,6 +19,7 @@ from fragprune_plugins.engines.inputs import (
     native_threads,
     plain,
 )
+from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.types import RasterOutputs, Splats
 
 if TYPE_CHECKING:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from fragprune_plugins.engines import create_engine
+from fragprune_plugins.engines.calling import address
 from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.engines.cuda import driver
 from fragprune_plugins.engines.cuda.engine import CudaEngine
@@ -29,7 +30,6 @@ from fragprune_plugins.engines.cuda.frame import (
     launch_sort,
 )
 from fragprune_plugins.engines.cuda.self_check import BEGUN, COULD_NOT_RUN, FAILS
-from fragprune_plugins.engines.inputs import address
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import KernelError
 from fragprune_plugins.types import RasterInputs, Splats, View

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch.autograd.function import once_differentiable
 
+from fragprune_plugins.engines.calling import with_joined_sh
 from fragprune_plugins.engines.cuda.driver import Driver
 from fragprune_plugins.engines.cuda.frame import (
     Device,
@@ -16,7 +17,6 @@ from fragprune_plugins.engines.cuda.frame import (
     Wanted,
     learnable,
 )
-from fragprune_plugins.engines.inputs import with_joined_sh
 from fragprune_plugins.errors import EngineError, InputError
 from fragprune_plugins.types import RasterOutputs, Splats
 

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 import torch
 
 from fragprune_plugins.constants import TILE
+from fragprune_plugins.engines.calling import address, native_arrays, native_inputs, plain
 from fragprune_plugins.engines.cpu import binding
-from fragprune_plugins.engines.inputs import address, native_arrays, native_inputs, plain
 from fragprune_plugins.errors import EngineError
 from fragprune_plugins.types import Splats
 
