@@ -477,8 +477,8 @@ def _read_changes(fork: Fork) -> None:
 
 
 def read_getters(fork: Fork) -> list[Finding]:
-    """Errors of the model's getters. ``get_xyz`` may give something else where an attribute is set
-    that is None at first, if no method that scripts reach sets it.
+    """Errors of the model's getters. They may give something else where an attribute is set that
+    is None at first, if no method that scripts reach sets it.
     """
     methods = _methods(fork.repo)
     reached = {name for tree in fork.trees.values() for _, name in _method_calls(tree)}
@@ -495,10 +495,21 @@ def read_getters(fork: Fork) -> list[Finding]:
         for node in nodes(methods[name])
         if isinstance(node, ast.Assign) and not is_off(node.value)
     }
-    body = methods.get("get_xyz")
-    asked = re.findall(r"self\.(\w+) is not None", ast.unparse(body)) if body else []
-    unset = {each for each in asked if fork.is_off(each)} - made
-    return reading.read_getters(fork.repo, MODEL, unset)
+    found = []
+    for getter, stored in (
+        ("get_xyz", ""),
+        ("get_opacity", "_opacity"),
+        ("get_scaling", "_scaling"),
+    ):
+        body = methods.get(getter)
+        asked = re.findall(r"self\.(\w+) is not None", ast.unparse(body)) if body else []
+        unset = {each for each in asked if fork.is_off(each)} - made
+        if not stored:
+            found += reading.read_getters(fork.repo, MODEL, unset)
+        elif body and not plain.activates(body, stored, unset):
+            at = fork.repo.place(MODEL, f"{CLASS}.{getter}")
+            found.append(Finding.error("model-getter", at, f"{getter} is computed", stored))
+    return found
 
 
 # -- draws -----------------------------------------------------------------------------------------

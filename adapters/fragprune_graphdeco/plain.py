@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from weakref import WeakKeyDictionary
 
 from fragprune_graphdeco.call import RASTERIZER
 from fragprune_graphdeco.kernels import SPLAT, read_kernels
-from fragprune_graphdeco.reading import defaults
+from fragprune_graphdeco.reading import defaults, without
 from fragprune_plugins.adapting import (
     Function,
     HostRepo,
@@ -39,7 +39,7 @@ _OF_CALL = re.compile(
     r"opacity|opacities|features|shs|rotations?|\w*sh\w*"
 )
 """Parameters of a drawing function that move or select Gaussians, or are their values."""
-_SHAPES = {"repeat", "expand", "view", "reshape", "squeeze", "contiguous"}
+_SHAPES = {"repeat", "expand", "view", "reshape", "squeeze", "unsqueeze", "contiguous"}
 """Methods that change how often or in what shape a value stands, not the value."""
 _SAVES = re.compile(r"\.save_ply\(|scene\.save\(")
 _ACTIVATIONS = {
@@ -81,6 +81,7 @@ def _read_plain(repo: HostRepo) -> Plain:
     moving = dict(_of_drawing(repo))
     drawn = list(moving)
     made = [each for each in drawn if "3D_filter" not in each]
+    moving |= (getters := dict(_of_getters(repo, module, name)))
     reasons = [
         *flat,
         *made,
@@ -89,6 +90,7 @@ def _read_plain(repo: HostRepo) -> Plain:
         *_of_columns(repo, module, name),
         *_of_saving(repo, module, name),
         *_of_positions(repo, module, name),
+        *getters,
         *_of_others(repo, module),
         *_of_scripts(repo),
     ]
@@ -136,7 +138,8 @@ def _of_others(repo: HostRepo, module: str) -> Iterator[str]:
                 if says or whole:  # if not whole, it is no model that makes a picture
                     what = f"{each}, {says}" if says else each
                     yield f"{name}, which a script here trains: its PLY also holds {what} ({at})"
-            for reason in _of_saving(repo, other, name) if whole else ():
+            computed = (*_of_saving(repo, other, name), *dict(_of_getters(repo, other, name)))
+            for reason in computed if whole else ():
                 yield f"{name}, which a script here trains: {reason}"
 
 
@@ -199,34 +202,54 @@ def _of_saving(repo: HostRepo, module: str, name: str) -> Iterator[str]:
             expected = _ACTIVATIONS.get(attribute, (value,))
             if value not in expected and raw.get(attribute.removesuffix("_activation"), True):
                 yield f"its {attribute} is {value[:50]} ({repo.at(module, node.lineno)})"
+
+
+def _of_getters(repo: HostRepo, module: str, name: str) -> Iterator[tuple[str, bool]]:
+    """Opacities and scales that are not the activated ones; true if an attribute that is None at
+    first must be set for it.
+    """
     for getter, stored in (("get_opacity", "_opacity"), ("get_scaling", "_scaling")):
         body = repo.function(module, f"{name}.{getter}")
-        if body is not None and not _activates(body, stored):
-            yield f"{getter} is computed ({repo.place(module, f'{name}.{getter}')})"
+        if body is not None and not activates(body, stored):
+            asked = re.findall(r"self\.(\w+) is not None", ast.unparse(body))
+            first = {each: list(defaults(repo, module, each)) for each in asked}
+            unset = {each for each, values in first.items() if values and all(map(is_off, values))}
+            at = repo.place(module, f"{name}.{getter}")
+            yield f"{getter} is computed ({at})", activates(body, stored, unset)
 
 
-def _activates(getter: Function, stored: str) -> bool:
-    """Whether a getter returns a function of an attribute, or the attribute, in the end."""
-    known: dict[str, bool] = {}
+def activates(getter: Function, stored: str, unset: Collection[str] = ()) -> bool:
+    """Whether a getter returns the activated values of an attribute, or some of them.
 
-    def reads(value: ast.expr | None) -> bool:
+    What it does where attributes in ``unset`` are not None does not count.
+    """
+    activation = f"{stored[1:]}_activation"
+    activations = (f"self.{activation}", *_ACTIVATIONS[activation])
+    known: dict[str, str] = {}
+
+    def state(value: ast.expr | None) -> str:
         while isinstance(value, ast.Call) and getattr(value.func, "attr", "") in _SHAPES:
             value = value.func.value  # type: ignore[attr-defined]
-        if isinstance(value, ast.Call) and value.args:
-            return reads(value.args[0])
+        if isinstance(value, ast.Call) and len(value.args) == 1 and not value.keywords:
+            stands = ast.unparse(value.func) in activations and state(value.args[0]) == "stored"
+            return "activated" if stands else "computed"
         if isinstance(value, ast.Name):
-            return known.get(value.id, False)
-        return value is not None and ast.unparse(value) == f"self.{stored}"
+            return known.get(value.id, "computed")
+        return "stored" if value and ast.unparse(value) == f"self.{stored}" else "computed"
 
+    skipped = without(getter, unset)
     for statement in getter.body:
-        for node in nodes(statement):
+        for node in (each for each in nodes(statement) if id(each) not in skipped):
             if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
-                name = node.targets[0].id
-                known[name] = reads(node.value) or (
-                    node is not statement and known.get(name, False)
-                )
-    returned = [node for node in nodes(getter) if isinstance(node, ast.Return)]
-    return reads(max(returned, key=lambda each: each.lineno).value) if returned else False
+                name, made = node.targets[0].id, state(node.value)
+                if node is not statement and name in known:  # in one branch of several
+                    rows = rf"self\.{stored}_?\w*|{name}\[\w+\]"
+                    chosen = made == known[name] or re.fullmatch(rows, ast.unparse(node.value))
+                    made = known[name] if chosen else "computed"
+                known[name] = made
+    body = [node for node in nodes(getter) if id(node) not in skipped]
+    returned = [node for node in body if isinstance(node, ast.Return)]
+    return bool(returned) and all(state(each.value) == "activated" for each in returned)
 
 
 def _of_positions(repo: HostRepo, module: str, name: str) -> Iterator[str]:

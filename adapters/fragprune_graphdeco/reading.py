@@ -59,14 +59,7 @@ def computed(function: Function, attribute: str, unset: Collection[str] = ()) ->
 
     What it does where attributes in ``unset`` are not None does not count.
     """
-    off = {f"self.{each} is not None" for each in unset}
-    skipped = {
-        id(inner)
-        for node in nodes(function)
-        if isinstance(node, ast.If) and ast.unparse(node.test) in off
-        for each in node.body
-        for inner in nodes(each)
-    }
+    skipped = without(function, unset)
     body = [node for node in nodes(function) if id(node) not in skipped]
     names, assigned = {f"self.{attribute}"}, [each for each in body if isinstance(each, ast.Assign)]
     for node in assigned:
@@ -80,6 +73,18 @@ def computed(function: Function, attribute: str, unset: Collection[str] = ()) ->
     if others:
         return f"computed, it returns {others[0][:60]}"
     return None if returned else "computed, it returns nothing"
+
+
+def without(function: Function, unset: Collection[str]) -> set[int]:
+    """The ids of the nodes that are reached only where attributes in ``unset`` are not None."""
+    off = {f"self.{each} is not None" for each in unset}
+    return {
+        id(inner)
+        for node in nodes(function)
+        if isinstance(node, ast.If) and ast.unparse(node.test) in off
+        for each in node.body
+        for inner in nodes(each)
+    }
 
 
 def training_scripts(repo: HostRepo, *patterns: str) -> tuple[str, ...]:

@@ -258,18 +258,17 @@ def test_checkpoints_have_other_names_too(tmp_path):
     assert {number for number, _ in ForkAdapter().saved_iterations(tmp_path)} == {7, 9}
 
 
-GETTER = """        if self._new is not None:
-            return self._new
-        return self._xyz
-"""
+GETTER = "        if self._new is not None:\n            return self._new\n{}"
 SETS = "    def warp(self):\n        self._new = self.net()\n\n    def capture"
 
 
 @pytest.mark.parametrize("called", [False, True])
-def test_positions_may_be_others_where_no_script_sets_them(tmp_path, called):
+@pytest.mark.parametrize("value", ["self._xyz", "self.opacity_activation(self._opacity)"])
+def test_values_may_be_others_where_no_script_sets_them(tmp_path, value, called):
+    returned = f"        return {value}\n"
     repo = fork(
         tmp_path,
-        ("        return self._xyz\n", GETTER),
+        (returned, GETTER.format(returned)),
         ("sh_degree): ...", "sh_degree):\n        self._new = None"),
         ("    def capture", SETS),
         (STATEMENT, "gaussians.warp()" if called else STATEMENT),

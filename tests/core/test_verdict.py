@@ -125,14 +125,21 @@ def test_the_nearest_host_is_of_this_family(fork):
             "self.net(self._xyz)",
             "get_scaling is computed",
         ),
-        (
-            "self.scaling_activation(self._scaling)",
-            "self.scaling_activation(self._scaling) + self.least",
-            "get_scaling is computed",
+        *(
+            ("self.scaling_activation(self._scaling)", computed, "get_scaling is computed")
+            for computed in (
+                "self.scaling_activation(self._scaling) + self.least",
+                "self.net(self._scaling)",
+                "torch.clamp(self._scaling, 0, 1)",
+                "self.scaling_activation(self._scaling).net(2)",
+                "self.opacity_activation(self._scaling)",
+                "self._scaling",
+                "made\n        if self.still: made = self._scaling\n        return torch.exp(made)",
+            )
         ),
         (
             "return self.scaling_activation(self._scaling)",
-            "if self.still: return self._scaling\n        return self.net(self._scaling) * 2",
+            "made = self._scaling\n        if on: made = net(made)\n        return torch.exp(made)",
             "get_scaling is computed",
         ),
         ("{'params': [], 'name': 'f_dc'}", "{'params': [self._opacity]}", "not train positions"),
@@ -155,6 +162,10 @@ def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):
         ("= self._opacity.detach()", "= self.inverse_activation(self.get_opacity)"),
         ("opacity = pc.get_opacity\n", "opacity = pc.opacity_activation(pc._opacity)\n"),
         ("activation(self._scaling)", "activation(self._scaling.repeat(1, 3))"),
+        (
+            "return self.scaling_activation(self._scaling)",
+            "made = self._scaling\n        if on: made = made[at]\n        return torch.exp(made)",
+        ),
         ("shs = pc.get_features", "shs = pc.get_features(training)"),
         ("rotations=rotations\n    )\n", "rotations=rotations\n    )\n    image = image[:3]\n"),
     ],
