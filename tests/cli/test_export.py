@@ -67,3 +67,60 @@ def test_a_model_without_thresholds_is_written_as_it_is(tmp_path, name):
     assert result.exit_code == 0
     assert "no cutoffs" in result.stdout
     assert not models.load(tmp_path / name).pruned
+
+
+def edited(model, rows):
+    """Rows of a model as an editor saves them: in its order, moved, without cutoffs and stop."""
+    kept = {name: each[rows] for name, each in model.tensors.items()}
+    return replace(model, **kept | {"xyz": kept["xyz"] + 3}, thresholds=None)
+
+
+@pytest.fixture
+def pruned(tmp_path):
+    model = tiny.cut(tiny.random_model(), torch.linspace(0.1, 0.9, 60)).with_stop(0.02)
+    write_ply(tmp_path / "pruned.ply", model)
+    return model
+
+
+def test_cutoffs_return_to_the_gaussians_that_an_editor_left(tmp_path, pruned):
+    rows, out = torch.tensor([41, 7, 59, 0, 23]), tmp_path / "out.ply"
+    write_ply(tmp_path / "edited.ply", edited(pruned, rows))
+    words = ("--cutoffs", tmp_path / "pruned.ply", "--out", out)
+    report = run_json("export", tmp_path / "edited.ply", *words)
+    assert (report["gaussians"], report["thresholds"], report["stop"]) == (5, True, 0.02)
+    assert torch.equal(read_ply(out).falloff, pruned.falloff[rows])
+    assert torch.equal(read_ply(out).xyz, pruned.xyz[rows] + 3)
+
+
+def test_of_gaussians_that_look_alike_the_smallest_cutoff_returns(tmp_path, pruned):
+    like = torch.arange(60)
+    like[[8, 30]] = 4
+    looks = {"opacity": pruned.opacity[like], "f_dc": pruned.f_dc[like]}
+    write_ply(tmp_path / "pruned.ply", replace(pruned, **looks))
+    write_ply(tmp_path / "edited.ply", edited(replace(pruned, **looks), [30, 31]))
+    out = tmp_path / "out.ply"
+    run_json("export", tmp_path / "edited.ply", "--cutoffs", tmp_path / "pruned.ply", "--out", out)
+    assert torch.equal(read_ply(out).falloff, pruned.falloff[[4, 31]])
+
+
+@pytest.mark.parametrize("change", ["opacity", "f_dc"])
+def test_a_gaussian_without_its_like_gets_no_cutoff(tmp_path, pruned, change):
+    model = edited(pruned, torch.arange(60))
+    values = getattr(model, change).clone()
+    values[[3, 5]] += 0.01
+    write_ply(tmp_path / "edited.ply", replace(model, **{change: values}))
+    out = tmp_path / "out.ply"
+    words = ("--cutoffs", tmp_path / "pruned.ply", "--out", out)
+    result = run("export", tmp_path / "edited.ply", *words)
+    assert result.exit_code == 1
+    assert "[row-mismatch]" in result.stderr
+    assert "2 of 60 Gaussians" in result.stderr
+    assert not out.exists()
+
+
+def test_a_model_without_cutoffs_has_none_to_give(tmp_path, pruned):
+    write_ply(tmp_path / "plain.ply", pruned.untruncated())
+    words = ("--cutoffs", tmp_path / "plain.ply", "--out", tmp_path / "out.ply")
+    result = run("export", tmp_path / "pruned.ply", *words)
+    assert result.exit_code == 1
+    assert "plain.ply: a model without cutoffs" in result.stderr

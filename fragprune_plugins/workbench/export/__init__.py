@@ -9,10 +9,11 @@ import click
 from fragprune_plugins.constants import TRANSMITTANCE_MIN
 from fragprune_plugins.workbench.commands.command import Command, Report, work_of
 from fragprune_plugins.workbench.commands.options import MODEL, Number, OutFile, truncation_option
+from fragprune_plugins.workbench.commands.rules import Alone
 from fragprune_plugins.workbench.models import formats
 
 
-@click.command("export", cls=Command)
+@click.command("export", cls=Command, rules=[Alone(("--cutoffs", "--no-truncation"))])
 @click.argument("model", type=MODEL)
 @click.option(
     "--out",
@@ -33,6 +34,12 @@ from fragprune_plugins.workbench.models import formats
     help="Give the model a stop, also one that was never fine-tuned: a pixel draws the fragment "
     "that leaves less than this share of its light, and ends there. 0.01 is usual.",
 )
+@click.option(
+    "--cutoffs",
+    type=MODEL,
+    help="Take cutoffs and stop from this model, for MODEL out of an editor that dropped them. "
+    "Gaussians are found by opacity and colour, in any order and place.",
+)
 @truncation_option
 def command(**options: Any) -> Report:
     """Write MODEL with its cutoffs and its stop into one file.
@@ -52,5 +59,6 @@ def command(**options: Any) -> Report:
       fragprune export pruned.ply --out pruned.spz
       fragprune export model.spz --out model.ply --no-truncation
       fragprune export model.ply --out faster.ply --stop 0.01
+      fragprune export edited.ply --cutoffs pruned.ply --out again.ply
     """
     return work_of(__name__, **options)

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import torch
+
+from fragprune_plugins.errors import AlignmentError, ModelFileError
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.ply import THRESHOLD_COLUMN
+from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.models import formats
 from fragprune_plugins.workbench.models.model import load, save
@@ -18,12 +24,19 @@ from fragprune_plugins.workbench.pruning.visibility import visible
 
 
 def export(
-    *, model: Path, out: Path, drop: bool, stop: float | None, no_truncation: bool
+    *,
+    model: Path,
+    out: Path,
+    drop: bool,
+    stop: float | None,
+    cutoffs: Path | None,
+    no_truncation: bool,
 ) -> Report:
     """Do what ``fragprune export`` promises; its options are the arguments."""
     form = formats.named(out)
     require_place(out, model, thresholds=stop is not None)
     splat = load(model, truncation=not no_truncation)
+    splat = splat if cutoffs is None else _restored(splat, model, cutoffs)
     splat = splat if stop is None else splat.with_stop(stop)
     if splat.pruned:
         formats.expect_carrier(form, out)
@@ -57,3 +70,33 @@ def export(
         },
         "\n".join(lines),
     )
+
+
+def _restored(edited: Model, path: Path, source: Path) -> Model:
+    """A model with the cutoffs and rules of another, in which its Gaussians are found again.
+
+    Opacity and first colour tell which: editors that reorder, remove, move, turn and enlarge
+    Gaussians keep both to the bit. Of Gaussians that look alike the smallest cutoff serves.
+
+    Raises:
+        ModelFileError: ``source`` has no cutoffs.
+        AlignmentError: a Gaussian of ``edited`` is not in ``source``.
+    """
+    pruned = load(source)
+    if pruned.falloff is None:
+        raise ModelFileError(
+            str(source), "a model without cutoffs", "a pruned model", "Name the pruned one."
+        )
+    looks = [torch.cat([each.opacity, each.f_dc[:, 0]], dim=1) for each in (pruned, edited)]
+    kinds, of = torch.unique(torch.cat(looks), dim=0, return_inverse=True)
+    theirs, ours = of.split([len(pruned), len(edited)])
+    least = torch.full((len(kinds),), torch.inf)
+    found = least.scatter_reduce(0, theirs, pruned.falloff, "amin")[ours]
+    if strange := int(found.isinf().sum()):
+        raise AlignmentError(
+            str(path),
+            f"{strange:,} of {len(edited):,} Gaussians that {source} lacks",
+            "opacities and colours as they are there, to the bit",
+            "Leave colours alone and save a .ply, or prune the edited model: fragprune finetune.",
+        )
+    return replace(edited, thresholds=ThresholdStore.from_falloff(found).ruled(**pruned.rules))
