@@ -27,7 +27,8 @@ def scene(tmp_path):
 def test_writes_a_pair_and_a_table(scene, tmp_path):
     data, path, model = scene
     before = path.read_bytes()
-    out = tmp_path / "out.ply"
+    folder = tmp_path / "results"
+    out = folder / "out.ply"
     words = ("--data", data, "--out", out, "--train", "opacity")
     result = run("finetune", path, *words, "--iters", 10, "--pressure", 1e-3)
     assert result.exit_code == 0, result.stderr
@@ -37,7 +38,7 @@ def test_writes_a_pair_and_a_table(scene, tmp_path):
         "original",
         "pruned",
         "x fewer fragments",
-        f"fragprune view {out}. A page to share: fragprune report {tmp_path}",
+        f"fragprune view {out}. A page to share: fragprune report {folder} --data {data}\n",
     ):
         assert words in result.stdout
     assert "fine-tuning" in result.stderr

@@ -104,9 +104,13 @@ def test_comparisons_come_along_with_their_pictures(folder):
     assert report["command"] == "finetune"
     page = (out / "report.html").read_text()
     assert "<h2>Comparison</h2>" in page
+    assert "<p>A is ../pruned.ply, B is ../pruned.ply: as many fragments" in page
     assert "<h2>Profile</h2>" in page
-    panels = [*(out / "pictures").glob("*.png"), *(out / "more").glob("*.png")]
-    assert page.count("<h2>compare: ") + page.count("<h2>profile: ") == len(panels)
+    assert "without cutoffs" in page
+    assert "truncated" not in page
+    for heading, pictures in (("Comparison", "pictures"), ("Profile", "more")):
+        views = [file.stem.removesuffix("_panel") for file in (out / pictures).glob("*.png")]
+        assert all(f"<h2>{heading}: {view}</h2>" in page for view in views)
     alone = run_json("report", out / "pictures")
     assert (alone["command"], alone["views"]) == ("compare", [])
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from fragprune_plugins.files.reading import lies_in
 from fragprune_plugins.files.records import CONTROL
 from fragprune_plugins.learning.goals import Fewer
 from fragprune_plugins.workbench.goals import Faster, parse_goal
@@ -32,6 +33,9 @@ IS_CONTROL = ": a control, nothing is truncated."
 
 ITSELF = "itself"
 """The target of a measurement against the model's own pictures, as it came in."""
+
+PROFILED = {"untruncated": "without cutoffs", "truncated": "with cutoffs"}
+"""What people read for the columns of a profile."""
 
 VISIBLE = 35.0
 """A PSNR against itself, in dB, below which one is warned."""
@@ -208,9 +212,13 @@ def _by_pruning(before: dict[str, Any], after: dict[str, Any], control: dict[str
     return gained - without
 
 
-def next_steps(model: Path, folder: Path) -> str:
-    """A line on what to do with a model that a command wrote, and with the record in a folder."""
-    return f"Look at it: fragprune view {model}. A page to share: fragprune report {folder}"
+def next_steps(model: Path, folder: Path, scene: Path | None = None) -> str:
+    """A line on what to do with a model that a command wrote, and with the record in a folder.
+
+    ``scene`` is the folder of its photographs: elsewhere, ``report`` reads it only by name.
+    """
+    data = "" if scene is None or lies_in(scene, folder) else f" --data {scene}"
+    return f"Look at it: fragprune view {model}. A page to share: fragprune report {folder}{data}"
 
 
 def missed(data: dict[str, Any]) -> str:

@@ -101,14 +101,16 @@ class Finetuned:
         more |= {"cameras": pictures} if pictures else {}
         if not result.interrupted:
             more |= {"configuration": asked, "text": text}
+        scene = None
         if photographs is not None:
+            scene = photographs.folder
             more["photographs"] = photographs.as_dict() | {
                 "models": [str(self.model.resolve()), str(self.out.resolve())],
                 "filtered": False,
                 "drawing": {},
             }
         records.leave(self.out, "finetune", data | more)
-        text += f"\n{next_steps(self.out, self.out.parent)}"  # records name no folders
+        text += f"\n{next_steps(self.out, self.out.parent, scene)}"  # records name no folders
         return Report(data, text, exit_code=130 if result.interrupted else 0)
 
     def _data(self, figures: Sequence[dict[str, Any]]) -> dict[str, Any]:

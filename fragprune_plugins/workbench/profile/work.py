@@ -18,7 +18,7 @@ from fragprune_plugins.workbench.commands.opening import (
 from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
 from fragprune_plugins.workbench.figures.panels import leave_panels
-from fragprune_plugins.workbench.figures.wording import describe, nothing_drawn
+from fragprune_plugins.workbench.figures.wording import PROFILED, describe, nothing_drawn
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
 
@@ -58,9 +58,10 @@ def profile(
         "columns": measured,
         "warnings": warnings,
     }
-    names = {"untruncated": "without cutoffs", "truncated": "with cutoffs"}
-    columns_named = {names[key]: each for key, each in measured.items()}
-    lines = [describe(columns_named), *(f"Warning: {each}" for each in warnings)]
+    lines = [
+        describe({PROFILED[key]: each for key, each in measured.items()}),
+        *(f"Warning: {each}" for each in warnings),
+    ]
     if loaded.falloff is not None:
         points = torch.tensor([0.05, 0.25, 0.5, 0.75, 0.95])
         thresholds = loaded.falloff.cpu()
@@ -72,5 +73,6 @@ def profile(
             + ", ".join(f"{value:.3f}" for value in quantiles)
         )
     if out is not None:
-        lines.append(leave_panels(out, "profile", report, columns, shots, rasterizer))
+        named = {PROFILED[key]: each for key, each in columns.items()}
+        lines.append(leave_panels(out, "profile", report, named, shots, rasterizer))
     return Report(report, "\n".join(lines))

@@ -34,6 +34,7 @@ from fragprune_plugins.workbench.figures.page import Table, embedded
 from fragprune_plugins.workbench.figures.recorded import recorded
 from fragprune_plugins.workbench.figures.wording import (
     IS_CONTROL,
+    PROFILED,
     fewer,
     gain,
     headlines,
@@ -134,8 +135,7 @@ def _columns(record: Record) -> dict[str, dict[str, Any]]:
     if record.command == "compare":
         return {"A": data["a"], "B": data["b"]}
     if record.command == "profile":
-        columns: dict[str, dict[str, Any]] = data["columns"]
-        return columns
+        return {PROFILED[key]: each for key, each in data["columns"].items()}
     names = {"original": "before", "pruned": "after"}
     return {name: data[key] for name, key in names.items() if data.get(key)}
 
@@ -161,8 +161,10 @@ def _sentence(record: Record, among: Sequence[Path]) -> str:
     if len(columns) > 1 and record.command in ("run", "finetune"):
         control = data.get("control") or control_of(data, among)
         return of + outcome(record.command, data, control)
+    if record.command == "compare":
+        of = f"A is {data['a']['model']}, B is {data['b']['model']}: "
     if len(columns) > 1:
-        return f"{gain(columns[0], columns[-1])}."
+        return f"{of}{gain(columns[0], columns[-1])}."
     if columns:
         drawn, frame = columns[0]["fragments_per_pixel"], columns[0]["frame_ms"]
         return f"{drawn:.1f} fragments per pixel drawn, frames of {frame:.2f} ms."
@@ -321,5 +323,6 @@ def _files(records: list[Record], inside: Path, folder: Path) -> list[tuple[str,
                 if content.startswith(_PNG):
                     copy = f"{len(found)}.png"
                     (folder / copy).write_bytes(content)
-                    found.append((f"{record.command}: {file.stem}", copy))
+                    view = file.stem.removesuffix("_panel")
+                    found.append((f"{_heading(record)}: {view}", copy))
     return found

@@ -201,5 +201,6 @@ def _describe(
         f"Model: {summary.model_after or _saved(summary)}."
     )
     if summary.model_after and summary.output:
-        lines.append(next_steps(summary.model_after, summary.output))
+        scene = summary.photographs.folder if summary.photographs else None
+        lines.append(next_steps(summary.model_after, summary.output, scene))
     return "\n".join(lines)
