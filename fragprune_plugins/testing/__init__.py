@@ -17,4 +17,9 @@ _HOME = {"AdapterConformance": "conformance", "Chance": "host", "Host": "host"}
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    try:
+        module = import_module(f"{__name__}.{_HOME[name]}")
+    except ModuleNotFoundError as error:
+        remedy = "The conformance kit needs pip install 'fragprune-plugins[test]'."
+        raise ModuleNotFoundError(f"{error}. {remedy}", name=error.name) from error
+    return getattr(module, name)

@@ -2,6 +2,7 @@
 
 import os
 import re
+import sys
 import time
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 from conformance import broken_adapters as broken
 from miniatures.vanilla_3dgs import HOST
 
+from fragprune_plugins import testing
 from fragprune_plugins.hosts.seams import Role
 from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.testing import Host, invariants
@@ -163,3 +165,9 @@ def test_a_promise_that_a_host_cannot_be_asked_needs_a_reason(check):
 def test_a_reason_is_given_where_a_promise_cannot_be_asked():
     with pytest.raises(NotApplicable, match="nobody keeps it"):
         fresh(invariants.model_file, invariants.Case(Vanilla3DGS(), Unsaved(), HOST))
+
+
+def test_without_its_packages_the_kit_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "fragprune_plugins.testing.conformance", None)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'fragprune-plugins\[test\]'"):
+        _ = testing.AdapterConformance

@@ -104,7 +104,7 @@ def _report(figures: dict[str, Any], wrote: str, fragments: list[float]) -> Repo
     """The report, with fragments per pixel of each view."""
     mean = sum(fragments) / len(fragments)
     warnings = nothing_drawn(fragments)
-    cut = "truncated" if figures["truncated"] else "not truncated"
+    cut = "with cutoffs" if figures["truncated"] else "without cutoffs"
     return Report(
         figures | {"fragments_per_pixel": mean, "warnings": warnings},
         "\n".join(

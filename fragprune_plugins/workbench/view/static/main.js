@@ -520,10 +520,10 @@ async function start() {
     $("#about").textContent = `${[...new Set(counts)].join(" and ")} Gaussians`;
     const stop = Math.max(...scene.models.map(({ stop }) => stop ?? 0));
     if (stop > 0)  // they are looked at between portions
-        $("#about").textContent += `. A pixel ends when ${+(100 * stop).toPrecision(3)} % of its light is left, `
-            + "here a few fragments later";
+        $("#about").textContent += `. A pixel ends once ${+(100 * stop).toPrecision(3)} % of its light is left; `
+            + "this viewer ends it a few fragments later";
     if (scene.models.some(({ rim }) => rim === "soft"))
-        $("#about").textContent += ". Rims are soft, across a pixel; here they are hard";
+        $("#about").textContent += ". Its rims are soft, across a pixel; this viewer draws them hard";
 }
 
 function failed(error) {
