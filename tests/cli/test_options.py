@@ -73,3 +73,7 @@ def test_a_film_that_cannot_be_written_is_refused_before_it_is_drawn(
     result = run("render", given[0], "--orbit", "--out", tmp_path / name)
     assert result.exit_code == 2
     assert not (tmp_path / name).exists()
+
+
+def test_the_list_of_commands_cuts_no_sentence():
+    assert "..." not in run("--help").stdout.split("Commands:")[1]

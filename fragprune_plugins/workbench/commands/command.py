@@ -69,6 +69,10 @@ class Command(click.Command):
             )
         )
 
+    def get_short_help_str(self, limit: int = 45) -> str:
+        """The whole first sentence of --help: lists of commands wrap it instead of cutting it."""
+        return super().get_short_help_str(max(limit, 200))
+
     def make_context(
         self,
         info_name: str | None,
