@@ -4,7 +4,6 @@ import ctypes
 import hashlib
 import os
 import subprocess
-from functools import cached_property
 from pathlib import Path
 
 import torch
@@ -73,7 +72,7 @@ class EmulatedDevice:
             defined = [f"-D{name}={value}" for name, value in macros.items()]
             kernels = ("-x", "c++", "-include", str(HERE / "emulation.h"), self.source(source))
             if not path.exists():
-                self._build(path, "-shared", *self._flags, *defined, self._machine, *kernels)
+                self._compile(path, *self._flags, *defined, *kernels)
             library = ctypes.CDLL(str(path))
             library.emulated_message.restype = ctypes.c_char_p
             self.opened[key] = library
@@ -83,12 +82,14 @@ class EmulatedDevice:
         """The file of a source."""
         return str(SOURCES / f"{name}.cu")
 
-    @cached_property
-    def _machine(self) -> str:
-        """The emulation itself, compiled once."""
-        path = self._folder / "emulation.o"
+    def _compile(self, path: Path, *kernels: str) -> None:
+        self._build(path, "-shared", self._part("emulation"), *kernels)
+
+    def _part(self, name: str) -> str:
+        """A source of the emulation itself, compiled once."""
+        path = self._folder / f"{name}.o"
         if not path.exists():
-            self._build(path, "-c", str(HERE / "emulation.cpp"))
+            self._build(path, "-c", str(HERE / f"{name}.cpp"))
         return str(path)
 
     def _build(self, path: Path, *arguments: str) -> None:

@@ -26,7 +26,10 @@ WEAK void __tsan_destroy_fiber(void*);
 WEAK void __tsan_switch_to_fiber(void*, unsigned);
 WEAK void __tsan_acquire(void*);
 WEAK void __tsan_release(void*);
-// What it is told of volatile accesses: nothing, they are atomic.
+// Of traffic.cpp, where accesses are counted.
+WEAK void emulated_met(int begin, int end);
+WEAK void emulated_left();
+// What ThreadSanitizer is told of volatile accesses: nothing, they are atomic.
 #define SILENT(size)                                  \
   extern "C" void __tsan_volatile_read##size(void*) {} \
   extern "C" void __tsan_volatile_write##size(void*) {}
@@ -147,6 +150,7 @@ bool release(Block& block) {
       block.warp_given[w][l] = lanes[l].given;
       lanes[l].wait = Wait::kNothing;
     }
+    if (emulated_met) emulated_met(32 * w, 32 * w + 32);
     any = true;
   }
   int waiting = 0, gone = 0;
@@ -161,6 +165,7 @@ bool release(Block& block) {
     if (fiber.line != block.fibers[0].line) fail("threads of one block at different barriers");
     fiber.wait = Wait::kNothing;
   }
+  if (emulated_met) emulated_met(0, n);
   block.block_all = all;
   return true;
 }
@@ -256,6 +261,7 @@ void run_grid(unsigned blocks, int threads, int most_resident, void (*body)(cons
       if (idle > kPatience) fail("threads wait for each other forever");
     }
     if (!finished(block)) continue;
+    if (emulated_met) emulated_met(0, threads), emulated_left();
     idle = 0;
     if (queue.empty())
       resident.erase(resident.begin() + static_cast<std::ptrdiff_t>(which));
@@ -287,6 +293,11 @@ bool barrier(int line, bool v) {
   return m.block->block_all;
 }
 void pause() { wait(Wait::kPause, 0, 0); }
+bool on_stack(const volatile void* at) {
+  const std::vector<char>& stack = machine().fiber().stack;
+  const auto place = reinterpret_cast<uintptr_t>(at) - reinterpret_cast<uintptr_t>(stack.data());
+  return place < stack.size();
+}
 
 using Kernels = std::map<std::string, void (*)(const void*)>;
 Kernels& kernels() {

@@ -19,6 +19,7 @@
 #include <type_traits>
 
 #define FP_EMULATED
+#define UNSEEN __attribute__((no_sanitize("thread")))  // by what counts or orders accesses
 #define __device__
 #define __host__
 #define __global__
@@ -39,14 +40,14 @@ extern Index threadIdx, blockIdx;
 namespace emulated {
 
 template <class T>
-inline uint64_t as_word(T v) {
+UNSEEN inline uint64_t as_word(T v) {
   static_assert(sizeof v <= 8, "");
   uint64_t word = 0;
   memcpy(&word, &v, sizeof v);
   return word;
 }
 template <class T>
-inline T from_word(uint64_t word) {
+UNSEEN inline T from_word(uint64_t word) {
   T v;
   memcpy(&v, &word, sizeof v);
   return v;
@@ -56,20 +57,21 @@ inline T from_word(uint64_t word) {
 const uint64_t* exchange(int line, uint32_t mask, uint64_t given, bool fence = false);
 bool barrier(int line, bool v);  // whether all threads of the block gave true
 void pause();
+bool on_stack(const volatile void* at);  // of the thread that runs
 inline int lane() { return static_cast<int>(threadIdx.x) & 31; }
 
 template <class T>
-inline T shuffle(int line, uint32_t mask, T v, int from) {
+UNSEEN inline T shuffle(int line, uint32_t mask, T v, int from) {
   const uint64_t* all = exchange(line, mask, as_word(v));
   return from_word<T>(from >= 0 && from < 32 ? all[from] : all[lane()]);
 }
-inline uint32_t ballot(int line, uint32_t mask, bool v) {
+UNSEEN inline uint32_t ballot(int line, uint32_t mask, bool v) {
   const uint64_t* all = exchange(line, mask, v);
   uint32_t bits = 0;
   for (int l = 0; l < 32; l++) bits |= static_cast<uint32_t>(all[l] & 1) << l;
   return bits;
 }
-inline uint32_t match(int line, uint32_t mask, uint32_t v) {
+UNSEEN inline uint32_t match(int line, uint32_t mask, uint32_t v) {
   const uint64_t* all = exchange(line, mask, v);
   uint32_t bits = 0;
   for (int l = 0; l < 32; l++) bits |= static_cast<uint32_t>(all[l] == v) << l;
@@ -134,5 +136,5 @@ inline T atomicExch(T* at, U v) {
 #define FP_KERNEL(name, Arguments, blocks)                                      \
   static void name(const Arguments f);                                          \
   static emulated::Register name##_registered(                                  \
-      #name, [](const void* a) { name(*static_cast<const Arguments*>(a)); });   \
+      #name, [](const void* a) UNSEEN { name(*static_cast<const Arguments*>(a)); }); \
   static void name(const Arguments f)
