@@ -66,7 +66,7 @@ def test_an_edited_file_gets_its_cutoffs_back(tmp_path, built, browser):
         download.value.save_as(edited)
     assert np.array_equal(np.sort(opened_with), pruned.falloff.numpy())
     assert read_ply(edited).falloff is None
-    run_json("export", edited, "--cutoffs", site / "pruned.ply", "--out", out)
+    run_json("export", edited, site / "pruned.ply", "--out", out)
     got = read_ply(out)
     assert (len(got), got.stop) == (40, 0.02)
     own = [int((pruned.opacity[:, 0] == each).nonzero()) for each in got.opacity[:, 0]]

@@ -85,7 +85,7 @@ def pruned(tmp_path):
 def test_cutoffs_return_to_the_gaussians_that_an_editor_left(tmp_path, pruned):
     rows, out = torch.tensor([41, 7, 59, 0, 23]), tmp_path / "out.ply"
     write_ply(tmp_path / "edited.ply", edited(pruned, rows))
-    words = ("--cutoffs", tmp_path / "pruned.ply", "--out", out)
+    words = (tmp_path / "pruned.ply", "--out", out)
     report = run_json("export", tmp_path / "edited.ply", *words)
     assert (report["gaussians"], report["thresholds"], report["stop"]) == (5, True, 0.02)
     assert torch.equal(read_ply(out).falloff, pruned.falloff[rows])
@@ -99,7 +99,7 @@ def test_of_gaussians_that_look_alike_the_smallest_cutoff_returns(tmp_path, prun
     write_ply(tmp_path / "pruned.ply", replace(pruned, **looks))
     write_ply(tmp_path / "edited.ply", edited(replace(pruned, **looks), [30, 31]))
     out = tmp_path / "out.ply"
-    run_json("export", tmp_path / "edited.ply", "--cutoffs", tmp_path / "pruned.ply", "--out", out)
+    run_json("export", tmp_path / "edited.ply", tmp_path / "pruned.ply", "--out", out)
     assert torch.equal(read_ply(out).falloff, pruned.falloff[[4, 31]])
 
 
@@ -110,7 +110,7 @@ def test_a_gaussian_without_its_like_gets_no_cutoff(tmp_path, pruned, change):
     values[[3, 5]] += 0.01
     write_ply(tmp_path / "edited.ply", replace(model, **{change: values}))
     out = tmp_path / "out.ply"
-    words = ("--cutoffs", tmp_path / "pruned.ply", "--out", out)
+    words = (tmp_path / "pruned.ply", "--out", out)
     result = run("export", tmp_path / "edited.ply", *words)
     assert result.exit_code == 1
     assert "[row-mismatch]" in result.stderr
@@ -120,7 +120,14 @@ def test_a_gaussian_without_its_like_gets_no_cutoff(tmp_path, pruned, change):
 
 def test_a_model_without_cutoffs_has_none_to_give(tmp_path, pruned):
     write_ply(tmp_path / "plain.ply", pruned.untruncated())
-    words = ("--cutoffs", tmp_path / "plain.ply", "--out", tmp_path / "out.ply")
+    words = (tmp_path / "plain.ply", "--out", tmp_path / "out.ply")
     result = run("export", tmp_path / "pruned.ply", *words)
     assert result.exit_code == 1
     assert "plain.ply: a model without cutoffs" in result.stderr
+
+
+def test_cutoffs_cannot_be_given_back_and_left_out_at_once(tmp_path, pruned):
+    path = tmp_path / "pruned.ply"
+    result = run("export", path, path, "--no-truncation", "--out", tmp_path / "out.ply")
+    assert result.exit_code == 2
+    assert "PRUNED with --no-truncation" in result.stderr

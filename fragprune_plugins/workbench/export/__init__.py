@@ -13,8 +13,9 @@ from fragprune_plugins.workbench.commands.rules import Alone
 from fragprune_plugins.workbench.models import formats
 
 
-@click.command("export", cls=Command, rules=[Alone(("--cutoffs", "--no-truncation"))])
+@click.command("export", cls=Command, rules=[Alone(("PRUNED", "--no-truncation"))])
 @click.argument("model", type=MODEL)
+@click.argument("pruned", type=MODEL, required=False)
 @click.option(
     "--out",
     type=OutFile(*formats.ENDINGS),
@@ -34,12 +35,6 @@ from fragprune_plugins.workbench.models import formats
     help="Give the model a stop, also one that was never fine-tuned: a pixel draws the fragment "
     "that leaves less than this share of its light, and ends there. 0.01 is usual.",
 )
-@click.option(
-    "--cutoffs",
-    type=MODEL,
-    help="Take cutoffs and stop from this model, for MODEL out of an editor that dropped them. "
-    "Gaussians are found by opacity and colour, in any order and place.",
-)
 @truncation_option
 def command(**options: Any) -> Report:
     """Write MODEL with its cutoffs and its stop into one file.
@@ -53,12 +48,15 @@ def command(**options: Any) -> Report:
     .splat and .compressed.ply cannot hold thresholds: --no-truncation leaves them out. The output
     says what a format does not keep.
 
+    For a MODEL out of an editor that dropped cutoffs and stop, PRUNED gives them back. Gaussians
+    are found by opacity and colour, in any order and place.
+
     \b
     Examples:
       fragprune export pruned.ply --out for_viewer.ply
       fragprune export pruned.ply --out pruned.spz
       fragprune export model.spz --out model.ply --no-truncation
       fragprune export model.ply --out faster.ply --stop 0.01
-      fragprune export edited.ply --cutoffs pruned.ply --out again.ply
+      fragprune export edited.ply pruned.ply --out again.ply
     """
     return work_of(__name__, **options)

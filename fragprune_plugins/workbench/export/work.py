@@ -29,14 +29,14 @@ def export(
     out: Path,
     drop: bool,
     stop: float | None,
-    cutoffs: Path | None,
+    pruned: Path | None,
     no_truncation: bool,
 ) -> Report:
     """Do what ``fragprune export`` promises; its options are the arguments."""
     form = formats.named(out)
     require_place(out, model, thresholds=stop is not None)
     splat = load(model, truncation=not no_truncation)
-    splat = splat if cutoffs is None else _restored(splat, model, cutoffs)
+    splat = splat if pruned is None else _restored(splat, model, pruned)
     splat = splat if stop is None else splat.with_stop(stop)
     if splat.pruned:
         formats.expect_carrier(form, out)
