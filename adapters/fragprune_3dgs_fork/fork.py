@@ -32,6 +32,10 @@ PRIMITIVES = {"_prune_optimizer", "cat_tensors_to_optimizer", "replace_tensor_to
 """Methods that change rows or values of parameters inside the optimizer."""
 CHECKPOINT = r"(?:chkpnt|ckpt|checkpoint)[_-]?"
 """How names of checkpoints begin, before the iteration."""
+_CHECKPOINT = re.compile(
+    rf"(^|[/'\"]){CHECKPOINT}(['\"] \+ str\(\w+\) \+ ['\"]|{{\w*(:\w+)?}}|%d)\.pth"
+)
+"""A checkpoint's name in a source: its beginning, the iteration and nothing else."""
 _PROCESSES = re.compile(r"\bProcess\((.*\W)?target=|\bmp\.spawn\(")
 _EMPTIES = re.compile(r"\brmtree\(\w+\.model_path")
 """A script that removes its output folder, and with it the checkpoint to resume."""
@@ -264,6 +268,14 @@ def _check_script(fork: Fork, script: str) -> None:
     ]
     if phases:
         fork.refuse("script", script, f"several calls of {phases[0]}, which trains", "one training")
+    loops = [
+        node
+        for node in nodes(tree)
+        if isinstance(node, ast.For) and any(name == "backward" for _, name in _method_calls(node))
+    ]
+    counted = [each for each in loops if "iterations" in ast.unparse(each.iter)]
+    if any(each in nodes(outer)[1:] for each in counted for outer in loops):
+        fork.refuse("script", script, "a training in a loop", "one training")
     fork.one_run = fork.one_run or _not_resumed(fork.repo, script, tree)
 
 
@@ -275,14 +287,22 @@ def _not_resumed(repo: HostRepo, script: str, tree: ast.Module) -> str:
         return f"{script} has no {' and no '.join(dict.fromkeys(missing))}"
     if _EMPTIES.search(ast.unparse(tree)):
         return f"{script} removes its output folder"
-    names = (each.value for each in nodes(tree) if isinstance(each, ast.Constant))
-    texts = (each for each in names if isinstance(each, str))
-    if not any(re.search(rf"(^|/){CHECKPOINT}($|[{{%])", each) for each in texts):
-        return f"{script} has checkpoints of another name"
-    saved = [node.args[0] for node, name in _method_calls(tree) if name == "save" and node.args]
-    kept = [each for each in saved if "capture()" in ast.unparse(each)]
-    if not any(isinstance(each, ast.Tuple) and len(each.elts) == 2 for each in kept):
+    saved = [node.args for node, name in _method_calls(tree) if name == "save" and node.args[1:]]
+    kept = [each for each in saved if "capture()" in ast.unparse(each[0])]
+    if not any(isinstance(each[0], ast.Tuple) and len(each[0].elts) == 2 for each in kept):
         return f"{script} has checkpoints that are not its model and the iteration"
+    if not any(_CHECKPOINT.search(ast.unparse(file)) for _, file, *_ in kept):
+        return f"{script} has checkpoints of another name"
+    made = [node for node in nodes(tree) if isinstance(node, ast.Assign)]
+    assigned = [(node, ast.unparse(target)) for node in made for target in node.targets]
+    read = {
+        name: node.lineno
+        for node, names in assigned
+        if "load(" in ast.unparse(node.value) and "," in names
+        for name in re.findall(r"\w+", names)
+    }
+    if any(node.lineno > read.get(name, node.lineno) for node, name in assigned):
+        return f"{script} does not go on at the iteration of its checkpoint"
     capture = _methods(repo)["capture"]
     if not _returns_state(capture):
         return "its checkpoints have no state of an optimizer"
@@ -292,6 +312,10 @@ def _not_resumed(repo: HostRepo, script: str, tree: ast.Module) -> str:
         return f"its checkpoints hold whole networks, {', '.join(networks)}"
     if networks := sorted({*trained} - _mentioned(capture)):
         return f"its checkpoints lack networks, {', '.join(networks)}"
+    setup = ast.unparse(_methods(repo).get("training_setup", ast.Pass()))
+    values = re.findall(r"'params': \[self\.(\w+)\]", setup)
+    if lacking := sorted({*values} - _mentioned(capture)):
+        return f"its checkpoints lack {', '.join(lacking)}"
     return ""
 
 

@@ -14,7 +14,7 @@ from weakref import WeakKeyDictionary
 
 from fragprune_graphdeco.call import RASTERIZER
 from fragprune_graphdeco.kernels import SPLAT, read_kernels
-from fragprune_graphdeco.reading import defaults, without
+from fragprune_graphdeco.reading import computed, defaults, without
 from fragprune_plugins.adapting import (
     Function,
     HostRepo,
@@ -186,10 +186,14 @@ def _of_saving(repo: HostRepo, module: str, name: str) -> Iterator[str]:
         target, value = node.targets[0].id, ast.unparse(node.value)
         at = repo.at(module, node.lineno)
         for kind in raw:
-            if f"self.get_{kind}" in value:
+            if re.search(rf"self\.get_{kind}\b", value):
                 raw[kind] = False
                 if not re.search(r"inverse|log", value):
                     yield f"save_ply stores activated values, {target} = {value[:60]} ({at})"
+        if target in ("opacities", "scale") and (got := re.match(r"self\.(get_\w+_\w+)", value)):
+            getter = repo.function(module, f"{name}.{got[1]}")
+            if getter is None or computed(getter, {"scale": "_scaling"}.get(target, "_opacity")):
+                yield f"save_ply stores other values, {target} = {value[:60]} ({at})"
         if target in ("f_dc", "f_rest", "opacities", "scale", "rotation"):
             if re.match(r"np\.(zeros|ones)", value):
                 yield f"save_ply stores no {target}: {value[:60]} ({at})"
@@ -205,26 +209,34 @@ def _of_saving(repo: HostRepo, module: str, name: str) -> Iterator[str]:
 
 
 def _of_getters(repo: HostRepo, module: str, name: str) -> Iterator[tuple[str, bool]]:
-    """Opacities and scales that are not the activated ones; true if an attribute that is None at
+    """Getters of other values than the PLY's, activated; true if an attribute that is None at
     first must be set for it.
     """
-    for getter, stored in (("get_opacity", "_opacity"), ("get_scaling", "_scaling")):
-        body = repo.function(module, f"{name}.{getter}")
-        if body is not None and not activates(body, stored):
+    saved = ast.unparse(repo.function(module, f"{name}.save_ply") or ast.Pass())
+    for kind in ("xyz", "opacity", "scaling", "rotation"):
+        body = repo.function(module, f"{name}.get_{kind}")
+        at = repo.place(module, f"{name}.get_{kind}")
+        stands = kind == "xyz" and "self.get_xyz" in saved
+        if body is not None and not stands and not activates(body, f"_{kind}"):
             asked = re.findall(r"self\.(\w+) is not None", ast.unparse(body))
             first = {each: list(defaults(repo, module, each)) for each in asked}
             unset = {each for each, values in first.items() if values and all(map(is_off, values))}
-            at = repo.place(module, f"{name}.{getter}")
-            yield f"{getter} is computed ({at})", activates(body, stored, unset)
+            yield f"get_{kind} is computed ({at})", activates(body, f"_{kind}", unset)
+    for node in nodes(repo.function(module, f"{name}.get_features")):
+        called = ast.unparse(node.func) if isinstance(node, ast.Call) else "torch.cat"
+        if isinstance(node, ast.BinOp) or called != "torch.cat":
+            yield f"get_features is computed ({repo.place(module, f'{name}.get_features')})", False
 
 
 def activates(getter: Function, stored: str, unset: Collection[str] = ()) -> bool:
     """Whether a getter returns the activated values of an attribute, or some of them.
 
-    What it does where attributes in ``unset`` are not None does not count.
+    Positions have no activation. What it does where attributes in ``unset`` are not None does not
+    count.
     """
     activation = f"{stored[1:]}_activation"
-    activations = (f"self.{activation}", *_ACTIVATIONS[activation])
+    activations = (f"self.{activation}", *_ACTIVATIONS.get(activation, ()))
+    wanted = "activated" if activation in _ACTIVATIONS else "stored"
     known: dict[str, str] = {}
 
     def state(value: ast.expr | None) -> str:
@@ -249,7 +261,7 @@ def activates(getter: Function, stored: str, unset: Collection[str] = ()) -> boo
                 known[name] = made
     body = [node for node in nodes(getter) if id(node) not in skipped]
     returned = [node for node in body if isinstance(node, ast.Return)]
-    return bool(returned) and all(state(each.value) == "activated" for each in returned)
+    return bool(returned) and all(state(each.value) == wanted for each in returned)
 
 
 def _of_positions(repo: HostRepo, module: str, name: str) -> Iterator[str]:
@@ -275,6 +287,8 @@ def _of_scripts(repo: HostRepo) -> Iterator[str]:
         found = (each for each, text in files.items() if RASTERIZER in text)
         other = next((f", but {each.relative_to(repo.root)}" for each in found), "")
         yield f"what draws its PLY was not read: there is no gaussian_renderer{other}"
+    elif not any(_drawing(repo, module) for module in _renderers(repo)):
+        yield "what draws its PLY was not read: gaussian_renderer calls no rasterizer of 3DGS"
     if scripts and not any(map(_SAVES.search, files.values())):
         yield "none of its scripts saves a PLY"
 
@@ -303,12 +317,7 @@ def _of_drawing(repo: HostRepo) -> Iterator[tuple[str, bool]]:
     """
     scripts = [each.stem for each in repo.root.glob("*train*.py") if each.stem.isidentifier()]
     for module in _renderers(repo):
-        functions = [
-            node
-            for node in getattr(repo.tree(module), "body", ())
-            if isinstance(node, ast.FunctionDef) and _call(node)
-        ]
-        functions.sort(key=lambda each: each.name != "render")
+        functions = _drawing(repo, module)
         named = repo.mentions(scripts, [each.name for each in functions])
         others = [each for each in functions[1:] if each.name.startswith("render")]
         instead = [each for each in others if each.name in named and "render" not in named]
@@ -316,6 +325,13 @@ def _of_drawing(repo: HostRepo) -> Iterator[tuple[str, bool]]:
             yield from _Drawing(repo, module, function).reasons()
         if functions:
             return
+
+
+def _drawing(repo: HostRepo, module: str) -> list[ast.FunctionDef]:
+    """The functions of a module that draw, ``render`` first."""
+    body = getattr(repo.tree(module), "body", ())
+    found = [each for each in body if isinstance(each, ast.FunctionDef) and _call(each)]
+    return sorted(found, key=lambda each: each.name != "render")
 
 
 def _call(function: Function) -> ast.Call | None:
@@ -354,7 +370,6 @@ class _Drawing:
             each.arg for each, v in given if isinstance(getattr(v, "value", None), bool)
         }
         self.values: dict[str, list[ast.expr]] = {}
-        self._collect(function.body)
         models = [
             node.value.id
             for node in nodes(function)
@@ -363,10 +378,19 @@ class _Drawing:
             and isinstance(node.value, ast.Name)
         ]
         self.model = models[0] if models else "pc"
+        self.call = _call(function)
+        named = (*self.parameters, self.model)
+        self.made: dict[str, tuple[str, ...]] = {each: (each,) for each in named}
+        self.drawn = self.made
+        self._collect(function.body)
+        self.made = self.drawn
 
     def _collect(self, body: list[ast.stmt]) -> None:
-        """Note every assignment, except where an argument is needed that is off by default."""
+        """Note what every name is made of, except where an argument is needed that is off."""
         for node in body:
+            if any(each is self.call for each in nodes(node)):
+                self.drawn = self.made
+            before = self.made
             if isinstance(node, ast.If):
                 test = ast.unparse(node.test)
                 on = self._is_colour_option(node) or any(
@@ -374,16 +398,26 @@ class _Drawing:
                 )
                 none = any(re.fullmatch(rf"{each} is None|not {each}", test) for each in self.off)
                 self._collect([] if on else node.body)
-                self._collect([] if none else node.orelse)
+                if not none:
+                    then, self.made = self.made, before
+                    self._collect(node.orelse)
+                    self._join({} if on else then)
             elif isinstance(node, ast.Assign):
                 for target in node.targets:
                     self._assign(target, node.value)
             elif isinstance(node, ast.AnnAssign | ast.AugAssign):
                 if node.value:
                     self._assign(node.target, node.value)
+                    self._join(before if isinstance(node, ast.AugAssign) else {})
             else:
-                for field in ("body", "orelse", "finalbody"):
+                for field in ("body", "body", "orelse", "finalbody"):  # a loop's, twice
                     self._collect(getattr(node, field, []))
+                    self._join(before)
+
+    def _join(self, other: Mapping[str, tuple[str, ...]]) -> None:
+        """Names may also be made as they are elsewhere."""
+        joined = {each: (*self.made.get(each, ()), *made) for each, made in other.items()}
+        self.made = self.made | {each: tuple(dict.fromkeys(made)) for each, made in joined.items()}
 
     def _is_colour_option(self, node: ast.If) -> bool:
         """Whether a branch makes colours if an option asks for it that is off by default."""
@@ -400,34 +434,31 @@ class _Drawing:
             for index, each in enumerate(target.elts):
                 self._assign(each, value.elts[index] if several else value)  # type: ignore[attr-defined]
         elif isinstance(target, ast.Subscript):
+            before = self.made
             self._assign(target.value, value)
+            self._join(before)
         elif isinstance(target, ast.Name):
             self.values.setdefault(target.id, []).append(value)
+            self.made = self.made | {target.id: tuple(dict.fromkeys(self._roots(value)))}
 
-    def _roots(self, node: ast.expr, seen: frozenset[str] = frozenset()) -> Iterator[str]:
+    def _roots(self, node: ast.expr) -> Iterator[str]:
         """What an expression is made of: "model.x", parameters, and "model" itself."""
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
-            if node.value.id == self.model and not self.values.get(self.model):
+            if self.made.get(node.value.id) == (self.model,):
                 yield f"{self.model}.{node.attr}"
                 return
-            yield from self._roots(node.value, seen)
+            yield from self._roots(node.value)
         elif isinstance(node, ast.Name):
-            if node.id in seen:
-                return
-            if node.id in self.values:
-                for each in self.values[node.id]:
-                    yield from self._roots(each, seen | {node.id})
-            elif node.id in self.parameters:
-                yield node.id
+            yield from self.made.get(node.id, ())
         elif isinstance(node, ast.Subscript):
-            yield from self._roots(node.value, seen)
+            yield from self._roots(node.value)
         elif isinstance(node, ast.Lambda | ast.ListComp | ast.GeneratorExp | ast.Dict):
             return
         else:
             for child in ast.iter_child_nodes(node):
                 part = child.value if isinstance(child, ast.keyword) else child
                 if isinstance(part, ast.expr):
-                    yield from self._roots(part, seen)
+                    yield from self._roots(part)
 
     def selection(self) -> str:
         """The code that picks some of the model's rows, however they come to the first call."""
@@ -465,7 +496,7 @@ class _Drawing:
                 own = {"means3D": "get_xyz", "scales": "get_scaling", "rotations": "get_rotation"}
                 kept = f"{self.model}.{own.get(argument)}" in roots
                 yield f"{self.function.name} {what} ({at})", kept and self._beside(others)
-        if "shs" in given and "dc" not in given:
+        if "shs" in given:
             roots = [*self._roots(given["shs"])]
             if not roots and "colors_precomp" in given:
                 made = dict.fromkeys(self._roots(given["colors_precomp"]))

@@ -91,7 +91,7 @@ def training_scripts(repo: HostRepo, *patterns: str) -> tuple[str, ...]:
     """Scripts that train, the usual one first, by the first of the patterns that finds any."""
     for pattern in patterns:
         files = sorted(repo.root.glob(pattern), key=lambda each: (each.stem != "train", each))
-        paths = [each.relative_to(repo.root) for each in files if each.stem.isidentifier()]
+        paths = [each.relative_to(repo.root) for each in files if "." not in each.stem]
         parts = {each.as_posix(): ".".join(each.with_suffix("").parts) for each in paths}
         wanted = ("training_setup", "backward")
         if found := [k for k, name in parts.items() if len(repo.mentions([name], wanted)) > 1]:

@@ -74,9 +74,9 @@ def locate(
 ) -> tuple[HostRepo, HostAdapter]:
     """Find the checkout that is a script's folder or contains it, and its adapter; see ``choose``.
 
-    If it is no host, but its scripts import an installed host, or ``name`` is the adapter
-    of an installed host, the result is the installed package. With ``above`` the folder that
-    contains this one is looked at, too.
+    If no adapter finds a seam in it, but its scripts import an installed host, or ``name`` is the
+    adapter of an installed host, the result is the installed package. With ``above`` the folder
+    that contains this one is looked at, too.
     """
     try:
         return repo, choose(repo, adapters, name, select)
@@ -91,6 +91,8 @@ def locate(
                 else repo.imports(package) and not (repo.root / package).is_dir()  # its own
             )
         ]
+        if used and not name and any(each.held for each in attempt(repo, adapters)):
+            raise  # a host of its own, that draws by that package
         packages = [package for each in used if (package := HostRepo.installed(each))]
         outer = [HostRepo(repo.root.parent)] if above else []
         for candidate in (*outer, *packages):

@@ -294,3 +294,10 @@ def test_a_script_that_imports_an_installed_host_is_its_script(
     else:
         with pytest.raises(UnknownHostError):
             locate(HostRepo(scripts), adapters, name)
+
+
+def test_a_host_whose_scripts_import_an_installed_one_is_not_that_host(tmp_path, package):
+    own = skeleton(tmp_path / "own", groups=(*GROUPS, "exposure"))
+    (own.root / "convert.py").write_text("import toyhost_of_tests")
+    with pytest.raises(UnknownHostError, match="no adapter fits"):
+        locate(own, [Vanilla3DGS(), Installed()])

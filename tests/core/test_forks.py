@@ -30,6 +30,7 @@ USED = ('package["render"]', 'package["render"] + package["{}"]')
 SERVED = {
     "an extra group": {},
     "another script": {"script": "train_scene.py"},
+    "a script that no module may be": {"script": "train-scene.py"},
     "another package": {"package": "a_rasterizer"},
     "a value that nobody reads": {"values": "image, radii, touched"},
     "a value without a name": {"values": "image, radii, _"},
@@ -280,6 +281,12 @@ NOT_RESUMED = {
     "no restore": ("gaussians.restore(", "gaussians.load("),
     "no capture": ("def capture(", "def other("),
     "another name": ("chkpnt", "state"),
+    "more in its name": ("chkpnt{iteration}", "chkpnt{iteration}_of_{views}"),
+    "a count that begins anew": (
+        "gaussians.restore(torch.load(checkpoint), opt)",
+        "state, at = torch.load(checkpoint)\n        gaussians.restore(state)\n        at = 0",
+    ),
+    "a lost parameter": ("self.poses)", "self.masks)"),
     "a dict": ("((gaussians.capture(), iteration)", '({"model": gaussians.capture(), "at": 1}'),
     "a removed folder": ("scene = Scene(", "shutil.rmtree(opt.model_path); scene = Scene("),
     "a lost state": ("self.optimizer.state_dict()", "None"),
@@ -412,6 +419,16 @@ REFUSED = {
         {},
         [("        loss.backward()\n", "        loss.backward()\n        depth_loss.backward()\n")],
         "2 places that go backward",
+    ),
+    "a loop of trainings": (
+        {},
+        [
+            (
+                "    for iteration in range(opt.iterations):\n",
+                "    for scan in scans:\n     for iteration in range(opt.iterations):\n",
+            )
+        ],
+        "a training in a loop",
     ),
     "several phases": (
         {},

@@ -18,6 +18,14 @@ MODEL = """
     def get_scaling(self):
         return self.scaling_activation(self._scaling)
 
+    @property
+    def get_xyz(self):
+        return self._xyz
+
+    @property
+    def get_features(self):
+        return torch.cat((self._features_dc, self._features_rest), dim=1)
+
     def create_from_pcd(self, pcd):
         scales = torch.log(distances)[..., None].repeat(1, 3)
 
@@ -115,6 +123,16 @@ def test_the_nearest_host_is_of_this_family(fork):
             "means3D from pc, not from its PLY",
         ),
         ("shs = pc.get_features", "shs = pc.network(view)", "colours from pc.network"),
+        (
+            "means3D = pc.get_xyz\n",
+            "means3D = pc.get_xyz\n    for each in pc.nets: means3D = each(means3D, pc.feature)\n",
+            "means3D from pc.feature",
+        ),
+        ("return self._xyz", "return self._xyz + self.moved", "get_xyz is computed"),
+        ("return torch.cat((", "return self.net((", "get_features is computed"),
+        ("shs=shs, scales", "dc=shs, shs=pc.net(view), scales", "colours from pc.net"),
+        ("= self._opacity.detach()", "= self.get_opacity_now.detach()", "stores other values"),
+        ("means3D=means3D, ", "means=means3D, ", "gaussian_renderer calls no rasterizer"),
         ('"opacity"]', '"opacity", "binding_0"]', "binding, positions relative to the triangles"),
         ('names.append("f_dc_{}".format(i))', "...", "lacks the columns f_dc"),
         (".repeat(1, 3)", ".repeat(1, 2)", "flat, with two scales"),
@@ -167,6 +185,11 @@ def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):
             "made = self._scaling\n        if on: made = made[at]\n        return torch.exp(made)",
         ),
         ("shs = pc.get_features", "shs = pc.get_features(training)"),
+        ("    means3D = pc.get_xyz\n", "    means3D = pc.net(t)\n    means3D = pc.get_xyz\n"),
+        (
+            "rotations=rotations\n    )\n",
+            "rotations=rotations\n    )\n    opacity = pc.net(image)\n",
+        ),
         ("rotations=rotations\n    )\n", "rotations=rotations\n    )\n    image = image[:3]\n"),
     ],
 )
@@ -269,7 +292,7 @@ def test_another_kernel_makes_another_picture_of_the_same_ply(fork, tmp_path):
     project = tmp_path / "submodules/a"
     (project / "diff_gaussian_rasterization").mkdir(parents=True)
     (project / "diff_gaussian_rasterization/__init__.py").write_text("")
-    (project / "forward.cu").write_text("float alpha = min(0.99f, o * area(d));")
+    (project / "forward.cu").write_text("float alpha = min(0.99f, o * area(d)); T *= 1 - alpha;")
     verdict = judged(HostRepo(tmp_path))
     assert verdict.kind == "never"
     assert "no exp()" in verdict.reason

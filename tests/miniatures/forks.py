@@ -26,7 +26,8 @@ class GaussianModel:
         return self.scaling_activation(self._scaling)
 
     def capture(self):
-        return (self._xyz, self.optimizer.state_dict(), self.poses)
+        values = (self._features_dc, self._features_rest, self._opacity, self._rotation)
+        return (self._xyz, self._scaling, *values, self.optimizer.state_dict(), self.poses)
 
     def restore(self, model_args, training_args):
         self.training_setup(training_args)
