@@ -287,12 +287,12 @@ def _not_resumed(repo: HostRepo, script: str, tree: ast.Module) -> str:
         return f"{script} has no {' and no '.join(dict.fromkeys(missing))}"
     if _EMPTIES.search(ast.unparse(tree)):
         return f"{script} removes its output folder"
-    saved = [node.args for node, name in _method_calls(tree) if name == "save" and node.args[1:]]
-    kept = [each for each in saved if "capture()" in ast.unparse(each[0])]
-    if not any(isinstance(each[0], ast.Tuple) and len(each[0].elts) == 2 for each in kept):
-        return f"{script} has checkpoints that are not its model and the iteration"
-    if not any(_CHECKPOINT.search(ast.unparse(file)) for _, file, *_ in kept):
+    if not _CHECKPOINT.search(ast.unparse(tree)):
         return f"{script} has checkpoints of another name"
+    saved = [node.args[0] for node, name in _method_calls(tree) if name == "save" and node.args]
+    kept = [each for each in saved if "capture()" in ast.unparse(each)]
+    if not any(isinstance(each, ast.Tuple) and len(each.elts) == 2 for each in kept):
+        return f"{script} has checkpoints that are not its model and the iteration"
     made = [node for node in nodes(tree) if isinstance(node, ast.Assign)]
     assigned = [(node, ast.unparse(target)) for node in made for target in node.targets]
     read = {

@@ -31,7 +31,7 @@ _COLUMNS = ("f_dc", "f_rest", "opacity", "scale", "rot")
 _PLAIN = {"x", "y", "z", "nx", "ny", "nz", "l", *_COLUMNS}
 _OF_MODEL = re.compile(
     r"get_(xyz|opacity|scaling|rotation|features\w*|covariance)|_(xyz|opacity|scaling|rotation|"
-    r"features_dc|features_rest)|\w+_activation|\w*sh_degree|screenspace_points"
+    r"features_dc|features_rest)|\w+_activation|\w*sh_degree|get_max_sh_channels|screenspace_points"
 )
 """Attributes of the model that a plain drawing reads."""
 _OF_CALL = re.compile(
@@ -186,7 +186,7 @@ def _of_saving(repo: HostRepo, module: str, name: str) -> Iterator[str]:
         target, value = node.targets[0].id, ast.unparse(node.value)
         at = repo.at(module, node.lineno)
         for kind in raw:
-            if re.search(rf"self\.get_{kind}\b", value):
+            if re.search(rf"self\.get_{kind}\b", value) and not isinstance(node.value, ast.Compare):
                 raw[kind] = False
                 if not re.search(r"inverse|log", value):
                     yield f"save_ply stores activated values, {target} = {value[:60]} ({at})"

@@ -178,6 +178,11 @@ def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):
         ("means3D = pc.get_xyz", "means3D = moved(camera_pose, pc.get_xyz)"),
         ('"opacity"]', '"opacity", "obj_dc_0"]'),
         ("= self._opacity.detach()", "= self.inverse_activation(self.get_opacity)"),
+        (
+            "        scale = self._sc",
+            "        mask = self.get_opacity > 0\n        scale = self._sc",
+        ),
+        ("shs = pc.get_features", "shs = cut(pc.get_features, pc.get_max_sh_channels)"),
         ("opacity = pc.get_opacity\n", "opacity = pc.opacity_activation(pc._opacity)\n"),
         ("activation(self._scaling)", "activation(self._scaling.repeat(1, 3))"),
         (

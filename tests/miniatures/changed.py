@@ -17,7 +17,7 @@ GROUPS = """
             {"params": [self._rotation], "lr": training_args.rotation_lr, "name": "rotation"},
         ]
         self.tone = torch.nn.Parameter(torch.zeros(1))
-        self.tones = torch.optim.Adam([{"params": [self.tone], "lr": 0.1, "name": "tone"}])
+        self.tones = torch.optim.Adam([self.tone], lr=0.1)
 """
 LOSS = "        loss = (1 - opt.lambda_dssim) * l1_loss(image, truth)\n"
 SUMS = "D += depths[collected_id[j]] * alpha * T; out_depth[pix_id] = D;"
