@@ -29,7 +29,6 @@ _QUADRATIC = re.compile(
     r"-0\.5\*\((\w+)\.x\*(\w+)\.x\*\2\.x\+\1\.z\*\2\.y\*\2\.y\)-\1\.y\*\2\.x\*\2\.y"
 )
 _SURFEL = re.compile(r"-0\.5\*rho")
-_BLENDS = re.compile(r"\b1(\.0?)?-alpha\b")
 _POLYNOMIAL = re.compile(r"[\w.+()-]*(?:\*[\w.+()-]+){5,}")
 """Sums of products, as when a quadratic form is multiplied out; ours to read by a proof only."""
 _LAUNCH = re.compile(r"\b(\w+)\s*(?:<[^<>;]*>)?\s*<<\s*<")
@@ -167,9 +166,6 @@ class _Project:
             if re.fullmatch(r"[\d.]+", text):  # a start, which the code below it changes
                 continue
             exponent = self._exponent(path, position, text)
-            behind = _normal(self.texts[path][position:].partition("__global__")[0])
-            if exponent is None and not _BLENDS.search(behind):
-                continue
             if exponent is None or "min(0.99," not in text:
                 what = "no exp()" if exponent is None else "not capped at 0.99"
                 yield self._finding(path, position, f"alpha = {_short(text)}: {what}", kernel.says)

@@ -85,9 +85,9 @@ def _read_plain(repo: HostRepo) -> Plain:
     reasons = [
         *flat,
         *made,
+        *_of_columns(repo, module, name),
         *(() if flat else _of_kernel(repo)),
         *drawn,
-        *_of_columns(repo, module, name),
         *_of_saving(repo, module, name),
         *_of_positions(repo, module, name),
         *getters,

@@ -35,7 +35,6 @@ __global__ void draw(float4* conics, float2* at) {
         float4 c = conics[k];
         %s
         if (alpha < 1.0f / 255.0f) continue;
-        T = T * (1.0f - alpha);
     }
 }
 void launch() { draw <<<grid, block>>>(conics, at); }
@@ -90,14 +89,6 @@ def test_one_that_draws_by_another_is_refused_by_line(tmp_path, changed, says):
 )
 def test_the_rule_is_known_in_other_spellings(tmp_path, blend):
     vendor(tmp_path, blend=blend)
-    assert not errors(skeleton(tmp_path))
-
-
-def test_an_alpha_that_is_not_blended_is_no_rule(tmp_path):
-    vendor(tmp_path)
-    source = tmp_path / "submodules/a/cuda/forward.cu"
-    shown = "__global__ void shown(float* q) { float alpha = (q[0] - least) / span; }\n"
-    source.write_text(source.read_text() + shown)
     assert not errors(skeleton(tmp_path))
 
 
