@@ -81,15 +81,13 @@ def locate(
     try:
         return repo, choose(repo, adapters, name, select)
     except UnknownHostError:
+        named = name and name.replace("_", "-")
         used = [
             package
             for adapter in adapters
             for package in adapter.installed[:1]
-            if (
-                name.replace("_", "-") == adapter.name
-                if name
-                else repo.imports(package) and not (repo.root / package).is_dir()  # its own
-            )
+            if named == adapter.name
+            or (not name and repo.imports(package) and not (repo.root / package).is_dir())
         ]
         if used and not name and any(each.held for each in attempt(repo, adapters)):
             raise  # a host of its own, that draws by that package
