@@ -9,6 +9,7 @@ from finetune import tiny
 
 from fragprune_plugins.files.ply import write_ply
 from fragprune_plugins.types import RasterInputs
+from fragprune_plugins.workbench.figures import evaluate
 from fragprune_plugins.workbench.figures.drawing import rasterize
 from fragprune_plugins.workbench.figures.metrics import psnr
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
@@ -28,6 +29,16 @@ def test_two_models(tmp_path):
     text = run("compare", path, other, "--data", data).stdout
     assert "B against A: " in text
     assert "x fewer fragments" in text
+
+
+@pytest.mark.parametrize(("silent", "shows"), [(0, True), (100, False)])
+def test_a_long_measurement_shows_how_far_it_is(tmp_path, monkeypatch, silent, shows):
+    data, path, _ = tiny.scene(tmp_path)
+    monkeypatch.setattr(evaluate, "SILENT", silent)
+    result = run("compare", path, path, "--data", data)
+    for words in ("measuring:", "timing frames:"):
+        assert (words in result.stderr) is shows
+        assert words not in result.stdout
 
 
 def test_frames_are_timed_at_another_size(tmp_path, monkeypatch):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -11,19 +11,24 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.area import SQUARED_RADIUS
 from fragprune_plugins.plugins.hooks import engine_for, thresholds_for
 from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View, one_line
-from fragprune_plugins.workbench.figures.clock import timed
+from fragprune_plugins.workbench.figures.clock import Made, timed
 from fragprune_plugins.workbench.figures.extents import covered
 from fragprune_plugins.workbench.figures.metrics import lpips, psnr, ssim
 from fragprune_plugins.workbench.models import model as models
+from fragprune_plugins.workbench.ranks import launched
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 
 REPEATS = 9
+
+SILENT = 2.0
+"""Seconds of measuring before a bar shows how far it is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +127,7 @@ def measure_all(
     reports: list[dict[str, Any]] = []
     for candidate, splats in zip(candidates, drawn, strict=True):
         rows, distances = [], []
-        for shot in shots:
+        for shot in _bar(shots, "measuring"):
             outputs = candidate.draw(engine, shot.view, splats)
             seen = shot.looked_at(outputs.image)
             distances.append(lpips(seen, shot.image))
@@ -162,6 +167,12 @@ def measure_all(
     return reports
 
 
+def _bar(items: Sequence[Made], what: str) -> Iterable[Made]:
+    """The items, with a bar that shows how far they are; of several processes one shows it."""
+    bar: Iterable[Made] = tqdm(items, what, leave=False, delay=SILENT, disable=not launched().first)
+    return bar
+
+
 def _mean(values: Sequence[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return statistics.fmean(known) if len(known) == len(values) else None
@@ -199,7 +210,7 @@ def frame_times(
     drawn = [candidate.model.splats() for candidate in candidates]
     times: list[list[list[float]]] = [[] for _ in candidates]  # candidate, repeat, view
     turns = list(zip(candidates, drawn, times, strict=True))
-    for _ in range(repeats):
+    for _ in _bar(range(repeats), "timing frames"):
         for rounds in times:
             rounds.append([])
         for view in views:
