@@ -114,9 +114,9 @@ class Fork:
     colours: frozenset[str] = frozenset()
 
     def warn(self, code: str, where: str, found: str) -> None:
-        """Add a warning, once."""
-        warning = Finding("warning", code, where, found)
-        self.findings += [] if warning in self.findings else [warning]
+        """Add a warning, once for all places."""
+        if all(each.found != found for each in self.findings):
+            self.findings.append(Finding("warning", code, where, found))
 
     def defines(self, method: str) -> bool:
         """Whether the model has a method of this name."""

@@ -10,6 +10,7 @@ import ast
 import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
+from pathlib import Path
 from weakref import WeakKeyDictionary
 
 from fragprune_graphdeco.call import RASTERIZER
@@ -42,12 +43,12 @@ _OF_CALL = re.compile(
 _SHAPES = {"repeat", "expand", "view", "reshape", "squeeze", "unsqueeze", "contiguous"}
 """Methods that change how often or in what shape a value stands, not the value."""
 _SAVES = re.compile(r"\.save_ply\(|scene\.save\(")
+_UNSAVED = "none of its scripts saves a PLY"
+_FUNCTIONAL = ("torch.nn.functional", "nn.functional", "F")
 _ACTIVATIONS = {
     "scaling_activation": ("torch.exp",),
     "opacity_activation": ("torch.sigmoid",),
-    "rotation_activation": (
-        *("torch.nn.functional.normalize", "nn.functional.normalize", "F.normalize"),
-    ),
+    "rotation_activation": tuple(f"{each}.normalize" for each in _FUNCTIONAL),
 }
 
 
@@ -56,11 +57,13 @@ def read_models(repo: HostRepo) -> list[Plain]:
     patterns = ("*/" * deep + "gaussian_renderer" for deep in range(1, _DEEPEST + 1))
     found = (path.parent for each in patterns for path in repo.root.glob(each) if path.is_dir())
     names = (each.relative_to(repo.root).as_posix() for each in sorted(found))
-    inside = [each for each in names if "/." not in f"/{each}"]
-    return [
-        read_plain(repo),
-        *(replace(read_plain(HostRepo(repo.root / each)), folder=each) for each in inside),
-    ]
+    saved = any(map(_SAVES.search, _scripts(repo).values()))  # also what is in a folder
+    models = [read_plain(repo)]
+    for each in (name for name in names if "/." not in f"/{name}"):
+        model = read_plain(HostRepo(repo.root / each))
+        reasons = tuple(why for why in model.reasons if not saved or why != _UNSAVED)
+        models.append(replace(model, folder=each, reasons=reasons))
+    return models
 
 
 _known: WeakKeyDictionary[HostRepo, Plain] = WeakKeyDictionary()
@@ -209,9 +212,7 @@ def _of_saving(repo: HostRepo, module: str, name: str) -> Iterator[str]:
 
 
 def _of_getters(repo: HostRepo, module: str, name: str) -> Iterator[tuple[str, bool]]:
-    """Getters of other values than the PLY's, activated; true if an attribute that is None at
-    first must be set for it.
-    """
+    """Getters of other values than the PLY's; true if only where an attribute was set later."""
     saved = ast.unparse(repo.function(module, f"{name}.save_ply") or ast.Pass())
     for kind in ("xyz", "opacity", "scaling", "rotation"):
         body = repo.function(module, f"{name}.get_{kind}")
@@ -229,10 +230,9 @@ def _of_getters(repo: HostRepo, module: str, name: str) -> Iterator[tuple[str, b
 
 
 def activates(getter: Function, stored: str, unset: Collection[str] = ()) -> bool:
-    """Whether a getter returns the activated values of an attribute, or some of them.
+    """Whether a getter returns rows of an attribute, activated if they are no positions.
 
-    Positions have no activation. What it does where attributes in ``unset`` are not None does not
-    count.
+    What it does where attributes in ``unset`` are not None does not count.
     """
     activation = f"{stored[1:]}_activation"
     activations = (f"self.{activation}", *_ACTIVATIONS.get(activation, ()))
@@ -281,16 +281,21 @@ def _of_positions(repo: HostRepo, module: str, name: str) -> Iterator[str]:
 
 def _of_scripts(repo: HostRepo) -> Iterator[str]:
     """A renderer that is not there, and scripts of which none saves a PLY."""
-    scripts, others = sorted(repo.root.glob("*.py")), sorted(repo.root.glob("*/*.py"))
-    files = {each: repo.read(each) for each in (*scripts, *others) if each.parent.name != "scene"}
+    files = _scripts(repo)
     if repo.path("gaussian_renderer") is None:
         found = (each for each, text in files.items() if RASTERIZER in text)
         other = next((f", but {each.relative_to(repo.root)}" for each in found), "")
         yield f"what draws its PLY was not read: there is no gaussian_renderer{other}"
     elif not any(_drawing(repo, module) for module in _renderers(repo)):
         yield "what draws its PLY was not read: gaussian_renderer calls no rasterizer of 3DGS"
-    if scripts and not any(map(_SAVES.search, files.values())):
-        yield "none of its scripts saves a PLY"
+    if any(repo.root.glob("*.py")) and not any(map(_SAVES.search, files.values())):
+        yield _UNSAVED
+
+
+def _scripts(repo: HostRepo) -> dict[Path, str]:
+    """The files of a codebase that may draw or save its model, with their text."""
+    paths = [*sorted(repo.root.glob("*.py")), *sorted(repo.root.glob("*/*.py"))]
+    return {each: repo.read(each) for each in paths if each.parent.name != "scene"}
 
 
 def _of_kernel(repo: HostRepo) -> Iterator[str]:

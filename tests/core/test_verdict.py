@@ -230,6 +230,16 @@ def test_of_several_folders_one_with_a_plain_ply_decides(fork, tmp_path):
     assert judged(HostRepo(tmp_path)).kind == "finetune"
 
 
+def test_a_model_in_a_folder_may_be_saved_by_a_script_above(fork, tmp_path):
+    fork(root=tmp_path / "inner")
+    script = tmp_path / "inner/train.py"
+    saving = script.read_text()
+    script.write_text(saving.replace("scene.save(", "scene.show("))
+    assert judged(HostRepo(tmp_path)).reason == "inner/: none of its scripts saves a PLY"
+    (tmp_path / "slam.py").write_text(saving)
+    assert judged(HostRepo(tmp_path)).kind == "finetune"
+
+
 def test_a_model_that_is_not_in_the_checkout_is_looked_for_in_its_submodules(tmp_path):
     (tmp_path / ".gitmodules").write_text('[submodule "a"]\n\tpath = submodules/a\n')
     assert judged(HostRepo(tmp_path)).reason.endswith("not in the checkout: submodules/a")
