@@ -131,3 +131,12 @@ def test_cutoffs_cannot_be_given_back_and_left_out_at_once(tmp_path, pruned):
     result = run("export", path, path, "--no-truncation", "--out", tmp_path / "out.ply")
     assert result.exit_code == 2
     assert "PRUNED with --no-truncation" in result.stderr
+
+
+def test_the_model_that_gives_cutoffs_is_not_overwritten(tmp_path, pruned):
+    path, before = tmp_path / "pruned.ply", (tmp_path / "pruned.ply").read_bytes()
+    write_ply(tmp_path / "edited.ply", edited(pruned, torch.arange(9)))
+    result = run("export", tmp_path / "edited.ply", path, "--out", path)
+    assert result.exit_code == 2
+    assert "the model's name" in result.stderr
+    assert path.read_bytes() == before

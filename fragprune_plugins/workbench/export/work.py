@@ -34,7 +34,8 @@ def export(
 ) -> Report:
     """Do what ``fragprune export`` promises; its options are the arguments."""
     form = formats.named(out)
-    require_place(out, model, thresholds=stop is not None)
+    for given in filter(None, (model, pruned)):
+        require_place(out, given, thresholds=stop is not None or pruned is not None)
     splat = load(model, truncation=not no_truncation)
     splat = splat if pruned is None else _restored(splat, model, pruned)
     splat = splat if stop is None else splat.with_stop(stop)
