@@ -23,6 +23,7 @@ SIZE, SMALLER = (760, 502), 4
 
 def main(checkout: Path, scene: Path) -> None:
     """Write the scene as COLMAP does."""
+    (scene / "sparse" / "0").mkdir(parents=True)  # refuses before it works where one is
     source = checkout / "Benchmarking_Camera_Calibration_2008" / "Herz-Jesus-P25"
     with tempfile.TemporaryDirectory() as name:
         folder, poses, focal = Path(name), {}, 0.0
@@ -48,7 +49,6 @@ def main(checkout: Path, scene: Path) -> None:
     for camera in found.cameras.values():
         camera.width, camera.height = SIZE
         camera.params = [each / 2 for each in camera.params]
-    (scene / "sparse" / "0").mkdir(parents=True)
     found.write(str(scene / "sparse" / "0"))
     print(found.summary())
 
