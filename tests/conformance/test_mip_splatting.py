@@ -1,7 +1,0 @@
-from conformance.relatives import RelativeConformance
-from miniatures.mip_splatting import MipHost
-
-
-class TestMipSplatting(RelativeConformance):
-    adapter = "mip-splatting"
-    host = MipHost
