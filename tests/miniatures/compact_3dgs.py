@@ -8,8 +8,18 @@ from typing import Any
 import numpy as np
 import torch
 
-from fragprune_plugins.testing.host import Action, Chance, Host
-from fragprune_plugins.testing.rewriting import rewrite
+from fragprune_plugins.testing.host import Action, Chance
+from miniatures.family import (
+    BACKWARD,
+    MODEL,
+    OPTIONS,
+    RENDERER,
+    SCENE,
+    STEP,
+    TRAIN,
+    Descendant,
+    adding,
+)
 
 NETWORK = '''"""Colours of places and directions, and codebooks; each network's weights lie flat."""
 
@@ -269,121 +279,98 @@ LOOKS = (  # of the demo's render: what gives way to the model's own
     '    shape = {"scales": None, "rotations": None, "cov3D_precomp": None}\n',
     "    image, radii = GaussianRasterizer(",
 )
-STEP = "                gaussians.optimizer.zero_grad(set_to_none=True)\n"
-CHANGES = {
-    "arguments/__init__.py": [
-        ("        self.sh_degree = 3\n", "        self.sh_degree = 0\n"),
-        (
-            "        self.eval = False\n",
-            "        self.eval = False\n        self.max_hashmap = 19\n"
-            "        self.rvq_size = 8\n        self.rvq_num = 2\n",
-        ),
-        (
-            "        self.random_background = False\n",
-            "        self.random_background = False\n        self.mask_prune_iter = 1_000\n"
-            "        self.rvq_iter = 29_000\n        self.mask_lr = 0.01\n"
-            "        self.net_lr = 0.01\n        self.net_lr_step = [5_000, 15_000, 25_000]\n"
-            "        self.lambda_mask = 0.0005\n",
-        ),
-    ],
-    "gaussian_renderer/__init__.py": [
-        (
-            "    override_color=None,\n",
-            "    override_color=None,\n    itr=-1,\n    rvq_iter=False,\n",
-        ),
-        (
-            "opacities=pc.get_opacity, **shape, **look\n",
-            "opacities=opacity, scales=scales,\n        rotations=rotations, shs=colours,\n",
-        ),
-    ],
-    "scene/gaussian_model.py": [
-        (
-            "from utils.sh_utils import RGB2SH\n",
-            "from utils.sh_utils import RGB2SH  # noqa: F401\n\n"
-            "from scene.network import HashGrid, Head, ResidualVQ\n",
-        )
-    ],
-    "scene/__init__.py": [
-        (
-            "gaussians.load_ply(self._ply(self.loaded_iter))",
-            'gaussians.load_model(self._ply(self.loaded_iter).removesuffix(".ply"))',
-        ),
-        (
-            "    def save(self, iteration):\n",
-            "    def save(self, iteration, compress=False, store=False):\n",
-        ),
-        (
-            "        self.gaussians.save_ply(self._ply(iteration))\n",
-            "        stored(self, iteration, compress, store)\n",
-        ),
-        ("import numpy as np\n", "import numpy as np\nimport torch\n"),
-        ("\n\nclass Scene:", "\n\n" + inspect.getsource(stored) + "\n\nclass Scene:"),
-    ],
-    "train.py": [
-        ("    debug_from,\n):", "    debug_from,\n    comp,\n    store_npz,\n):"),
-        ("GaussianModel(dataset.sh_degree)", "GaussianModel(dataset)"),
-        (
-            "gaussians, pipe, bg)\n",
-            "gaussians, pipe, bg, itr=iteration, rvq_iter=iteration > opt.rvq_iter)\n",
-        ),
-        (
-            "        loss.backward()\n",
-            "        loss = loss + opt.lambda_mask * torch.sigmoid(gaussians._mask).mean()\n"
-            "        loss.backward()\n",
-        ),
-        (
-            "            training_report(",
-            "            if iteration == opt.iterations:\n"
-            "                gaussians.final_prune(compress=comp)\n"
-            "                gaussians.precompute()\n            training_report(",
-        ),
-        ("scene.save(iteration)", "scene.save(iteration, compress=comp, store=store_npz)"),
-        (
-            "            if iteration < opt.iterations:\n",
-            "            after_densification(iteration, opt, gaussians)\n"
-            "            if iteration < opt.iterations:\n",
-        ),
-        (
-            STEP,
-            STEP + "                gaussians.optimizer_net.step()\n"
-            "                gaussians.optimizer_net.zero_grad(set_to_none=True)\n"
-            "                gaussians.scheduler_net.step()\n",
-        ),
-        (
-            "    args = parser.parse_args()\n",
-            '    parser.add_argument("--comp", action="store_true")\n'
-            '    parser.add_argument("--store_npz", action="store_true")\n'
-            "    args = parser.parse_args()\n",
-        ),
-        (
-            "        args.debug_from,\n    )",
-            "        args.debug_from,\n        args.comp,\n        args.store_npz,\n    )",
-        ),
-        (
-            'if __name__ == "__main__"',
-            inspect.getsource(after_densification) + '\n\nif __name__ == "__main__"',
-        ),
-    ],
-}
 
 
-class CompactHost(Host):
+class CompactHost(Descendant):
     """A mask, codebooks, and colours from a network with an optimizer of its own."""
 
-    lacks = {"checkpoint": "its checkpoints lack the mask and the network: it cannot resume them"}  # noqa: RUF012
+    lacks = {"checkpoint": "its checkpoints lack the mask and the network: it cannot resume them"}
     colour = frozenset({"hash grid", "colour network"})
     routine = ("densify and prune", "mask prune", "sort morton", "reset opacity")
+    options = {
+        "Loading": {"max_hashmap": 19, "rvq_size": 8, "rvq_num": 2},
+        "Optimization": {
+            "mask_prune_iter": 1_000,
+            "rvq_iter": 29_000,
+            "mask_lr": 0.01,
+            "net_lr": 0.01,
+            "net_lr_step": [5_000, 15_000, 25_000],
+            "lambda_mask": 0.0005,
+        },
+    }
+    flags = ('"--comp", action="store_true"', '"--store_npz", action="store_true"')
+    changes = {
+        OPTIONS: [("        self.sh_degree = 3\n", "        self.sh_degree = 0\n")],
+        RENDERER: [
+            adding("    override_color=None,\n", after="    itr=-1,\n    rvq_iter=False,\n"),
+            (
+                "opacities=pc.get_opacity, **shape, **look\n",
+                "opacities=opacity, scales=scales,\n        rotations=rotations, shs=colours,\n",
+            ),
+        ],
+        MODEL: [
+            adding(
+                "from utils.sh_utils import RGB2SH\n",
+                after="\nfrom scene.network import HashGrid, Head, ResidualVQ\n",
+            )
+        ],
+        SCENE: [
+            (
+                "gaussians.load_ply(self._ply(self.loaded_iter))",
+                'gaussians.load_model(self._ply(self.loaded_iter).removesuffix(".ply"))',
+            ),
+            (
+                "def save(self, iteration):",
+                "def save(self, iteration, compress=False, store=False):",
+            ),
+            (
+                "self.gaussians.save_ply(self._ply(iteration))\n",
+                "stored(self, iteration, compress, store)\n",
+            ),
+            adding("import numpy as np\n", after="import torch\n"),
+            adding("\n\nclass Scene:", before="\n\n" + inspect.getsource(stored)),
+        ],
+        TRAIN: [
+            adding("    debug_from,\n", after="    comp,\n    store_npz,\n"),
+            ("GaussianModel(dataset.sh_degree)", "GaussianModel(dataset)"),
+            ("pipe, bg)\n", "pipe, bg, itr=iteration, rvq_iter=iteration > opt.rvq_iter)\n"),
+            adding(
+                BACKWARD,
+                before="        mask = torch.sigmoid(gaussians._mask)\n"
+                "        loss = loss + opt.lambda_mask * mask.mean()\n",
+            ),
+            adding(
+                "            training_report(",
+                before="            if iteration == opt.iterations:\n"
+                "                gaussians.final_prune(compress=comp)\n"
+                "                gaussians.precompute()\n",
+            ),
+            ("scene.save(iteration)", "scene.save(iteration, compress=comp, store=store_npz)"),
+            adding(STEP, before="            after_densification(iteration, opt, gaussians)\n"),
+            adding(
+                "                gaussians.optimizer.zero_grad(set_to_none=True)\n",
+                after="                gaussians.optimizer_net.step()\n"
+                "                gaussians.optimizer_net.zero_grad(set_to_none=True)\n"
+                "                gaussians.scheduler_net.step()\n",
+            ),
+            adding(
+                "        args.debug_from,\n",
+                after="        args.comp,\n        args.store_npz,\n",
+            ),
+        ],
+    }
+    functions = (after_densification,)
+    added = Added
+    files = {"scene/network.py": NETWORK}
 
     def write(self, root: Path) -> None:
         super().write(root)
-        (root / "scene" / "network.py").write_text(NETWORK)
-        renderer = root / "gaussian_renderer" / "__init__.py"
+        renderer = root / RENDERER
         text = renderer.read_text()
         begin, end = (text.index(passage) for passage in LOOKS)
         taken = "pc.seen_from(viewpoint_camera, itr, rvq_iter)"
         own = f"    scales, rotations, opacity, colours = {taken}\n"
         renderer.write_text(text[:begin] + own + text[end:])
-        rewrite(root, CHANGES, Added)
 
     def new_model(self, degree: int) -> Any:
         from argparse import ArgumentParser

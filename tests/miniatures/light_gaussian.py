@@ -1,7 +1,6 @@
 """A miniature LightGaussian: the demo's host with what the method adds, from its interface."""
 
 import copy
-import inspect
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,8 +8,19 @@ import numpy as np
 import torch
 from torch.optim.lr_scheduler import ExponentialLR
 
-from fragprune_plugins.testing import Chance, Host
+from fragprune_plugins.testing import Chance
 from fragprune_plugins.testing.rewriting import changed
+from miniatures.family import (
+    MODEL,
+    PARSE,
+    RADII,
+    RENDERER,
+    STEP,
+    TRAIN,
+    Descendant,
+    adding,
+    parsing,
+)
 
 args = SimpleNamespace()  # the host's scripts hold their options under this name
 
@@ -130,110 +140,103 @@ def distil(dataset, opt, pipe, checkpoint):
                 torch.save((student.capture(), iteration), path)
 
 
-FLAGS = """    parser.add_argument("--prune_iterations", nargs="+", type=int, default=[16_000])
-    parser.add_argument("--prune_percent", type=float, default=0.5)
-    parser.add_argument("--prune_decay", type=float, default=0.8)
-"""
-TEACHING = """    parser.add_argument("--teacher_model")
-    parser.add_argument("--new_max_sh", type=int, default=2)
-    parser.add_argument("--augmented_view", action="store_true")
-    parser.add_argument("--enable_opacity", action="store_true")
-"""
 DENSIFY = (
     "            if iteration < opt.densify_until_iter:\n"
     "                densify(iteration, opt, dataset, gaussians, scene, package)\n"
 )
-STEP = "            if iteration < opt.iterations:\n"
-CHECKPOINT = "                torch.save((gaussians.capture(), iteration), path)\n"
+PRUNING = (
+    '"--prune_iterations", nargs="+", type=int, default=[16_000]',
+    '"--prune_percent", type=float, default=0.5',
+    '"--prune_decay", type=float, default=0.8',
+)
+TEACHING = parsing(
+    '"--teacher_model"',
+    '"--new_max_sh", type=int, default=2',
+    '"--augmented_view", action="store_true"',
+    '"--enable_opacity", action="store_true"',
+)
 BEGIN = (
     "    gaussians.training_setup(opt)\n    if checkpoint:\n"
     "        model_params, first_iter = torch.load(checkpoint)\n"
     "        gaussians.restore(model_params, opt)\n"
 )
-SCRIPT = [
-    ("import random\n", "import copy\nimport random\n"),
-    ("import torch\n", "import numpy as np\nimport torch\n"),
-    (
-        "from gaussian_renderer import render\n",
-        "from gaussian_renderer import count_render, render\n",
-    ),
-    (
-        "from tqdm import tqdm\n",
-        "from torch.optim.lr_scheduler import ExponentialLR\nfrom tqdm import tqdm\n",
-    ),
-    (BEGIN, "    first_iter = begin(gaussians, opt, checkpoint)\n"),
-    (
-        "        if not waiting:\n",
-        "        if iteration % 5 == 3:\n            gaussians.scheduler.step()\n"
-        "        if not waiting:\n",
-    ),
-    (STEP, "            prune(iteration, gaussians, scene, pipe, background)\n" + STEP),
-    (
-        CHECKPOINT,
-        CHECKPOINT + "                last_checkpoint(\n"
-        "                    iteration, checkpoint_iterations, gaussians, scene, pipe, background\n"
-        "                )\n",
-    ),
-]
 NO_START = '    args.start_pointcloud, args.must_start = "", False\n'
-START = (
-    '    parser.add_argument("--start_pointcloud")\n    args = parser.parse_args()\n'
-    "    args.must_start = True\n"
-)
-PARSE = "    args = parser.parse_args()\n"
 
 
-class LightGaussianHost(Host):
+class LightGaussianHost(Descendant):
     """Pruning by a score, and densification without it."""
 
     routine = (
-        "prune by score",
-        "prune by opacity",
-        "densify",
-        "densify and prune",
-        "reset opacity",
+        *("prune by score", "prune by opacity", "densify", "densify and prune", "reset opacity"),
         "another band",
     )
+    changes = {
+        RENDERER: [adding("debug=pipe.debug,\n", after="        f_count=False,\n")],
+        MODEL: [("torch.optim.Adam(", "torch.optim.AdamW(")],
+        TRAIN: [
+            adding("import random\n", before="import copy\n"),
+            adding("import torch\n", before="import numpy as np\n"),
+            (
+                "gaussian_renderer import render\n",
+                "gaussian_renderer import count_render, render\n",
+            ),
+            adding(
+                "from tqdm import tqdm\n",
+                before="from torch.optim.lr_scheduler import ExponentialLR\n",
+            ),
+            (BEGIN, "    first_iter = begin(gaussians, opt, checkpoint)\n"),
+            adding(
+                "        if not waiting:\n",
+                before="        if iteration % 5 == 3:\n            gaussians.scheduler.step()\n",
+            ),
+            adding(
+                STEP, before="            prune(iteration, gaussians, scene, pipe, background)\n"
+            ),
+            adding(
+                "                torch.save((gaussians.capture(), iteration), path)\n",
+                after="                ends = iteration, checkpoint_iterations\n"
+                "                last_checkpoint(*ends, gaussians, scene, pipe, background)\n",
+            ),
+        ],
+    }
+    functions = (prune_list, prune, last_checkpoint, begin, distil)
+    added = Added
 
     def write(self, root: Path) -> None:
         super().write(root)
-        renderer, model = root / "gaussian_renderer/__init__.py", root / "scene/gaussian_model.py"
-        text = changed(
-            renderer.read_text(),
-            [("debug=pipe.debug,\n", "debug=pipe.debug,\n        f_count=False,\n")],
-        )
+        renderer, train = root / RENDERER, root / TRAIN
+        text = renderer.read_text()
         counting = changed(
             text[text.index("def render(") :],
             [
                 ("def render(", "def count_render("),
                 ("f_count=False", "f_count=True"),
                 ("    image, radii =", "    count, score, image, radii ="),
-                (
-                    '        "radii": radii,\n',
-                    '        "radii": radii,\n        "gaussians_count": count,\n'
-                    '        "important_score": score,\n',
+                adding(
+                    RADII,
+                    after='        "gaussians_count": count,\n        "important_score": score,\n',
                 ),
             ],
         )
         renderer.write_text(text + "\n\n" + counting)
-        methods = "".join(inspect.getsourcelines(Added)[0][2:])
-        text = changed(model.read_text(), [("torch.optim.Adam(", "torch.optim.AdamW(")])
-        model.write_text(text + "\n" + methods)
-        functions = (prune_list, prune, last_checkpoint, begin, distil)
-        own = "\n\n".join(inspect.getsource(f) for f in functions)
-        text = changed((root / "train.py").read_text(), SCRIPT)
-        text = text.replace("if __name__", own + "\n\nif __name__")
-        train = changed(text, [(PARSE, FLAGS + PARSE + NO_START)])
-        finetune = changed(text, [(PARSE, FLAGS + START), (DENSIFY, "")])
+        text = train.read_text()
         call = text[text.index("    training(\n        lp.extract") :]
-        parse = TEACHING + PARSE
         groups = ", ".join(f"{group}.extract(args)" for group in ("lp", "op", "pp"))
-        new_call = f"    distil({groups}, args.start_checkpoint)\n"
-        distilling = changed(text, [(PARSE, parse), (call, new_call)])
-        (root / "train_densify_prune.py").write_text(train)
-        (root / "prune_finetune.py").write_text(finetune)
-        (root / "distill_train.py").write_text(distilling)
-        (root / "train.py").unlink()
+        start = [
+            parsing('"--start_pointcloud"'),
+            adding(PARSE, after="    args.must_start = True\n"),
+        ]
+        scripts = {
+            "train_densify_prune.py": [parsing(*PRUNING), adding(PARSE, after=NO_START)],
+            "prune_finetune.py": [parsing(*PRUNING), *start, (DENSIFY, "")],
+            "distill_train.py": [
+                TEACHING,
+                (call, f"    distil({groups}, args.start_checkpoint)\n"),
+            ],
+        }
+        for name, changes in scripts.items():
+            (root / name).write_text(changed(text, changes))
+        train.unlink()
 
     def model(self, arguments, count, *, seed, degree, setup):
         model = super().model(arguments, count, seed=seed, degree=degree, setup=setup)

@@ -1,77 +1,10 @@
 """A miniature LP-3DGS: the demo's host with what the method adds, from its interface."""
 
-from pathlib import Path
-
-from fragprune_plugins.testing.host import Host, densify_and_prune
-from fragprune_plugins.testing.rewriting import rewrite
+from fragprune_plugins.testing.host import densify_and_prune
+from miniatures.family import DRAWN, MODEL, PARSE, RENDERER, SCENE, STEP, TRAIN, Descendant, adding
 from miniatures.mini_splatting import LPIPS
-from miniatures.speedy_splat import DRAW, PARSE, RENDERER, STEP, TRAIN, Pruning
+from miniatures.speedy_splat import Pruning
 
-SCORES = ("f_count", "bw_score", "mw_score")
-LP = {
-    RENDERER: [
-        (
-            "    override_color=None,\n",
-            "    override_color=None,\n    test=False,\n    top_K_dT=None,\n"
-            + "".join(f"    {name}=False,\n" for name in SCORES),
-        ),
-        (
-            "debug=pipe.debug,\n",
-            "debug=pipe.debug,\n"
-            + "".join(f"        {name}={name},\n" for name in (*SCORES, "top_K_dT")),
-        ),
-        (
-            DRAW,
-            "    opacity, _ = pc.get_opacity_and_scales_for_train()\n"
-            "    result = GaussianRasterizer(raster_settings=settings)(\n",
-        ),
-        ("opacities=pc.get_opacity,", "opacities=opacity,"),
-        (
-            "    return {\n",
-            "    image, radii, count, score = result\n    return {\n"
-            '        "gaussians_count": count,\n        "important_score": score,\n',
-        ),
-    ],
-    "scene/gaussian_model.py": [
-        ("def oneupSHdegree(self):", "def oneupSHdegree(self, opt, iteration):"),
-        ("extent, max_screen_size):", "extent, max_screen_size, n_split, opt=None):"),
-    ],
-    "scene/__init__.py": [
-        (
-            "from scene.gaussian_model import GaussianModel\n",
-            "from scene.gaussian_model import GaussianModel\n"
-            "from scene.gaussian_model_mini_splatting import MiniSplatting\n"
-            "from scene.gaussian_model_rad_splat import RadSplat\n",
-        ),
-        (
-            "class Scene:\n",
-            'ModelPool = {"3dgs": GaussianModel, "mini_splatting": MiniSplatting, '
-            '"rad_splat": RadSplat}\n\n\nclass Scene:\n',
-        ),
-    ],
-    TRAIN: [
-        ("import torch\n", "import torch\nimport wandb\n"),
-        ("from scene import GaussianModel, Scene\n", "from scene import ModelPool, Scene\n"),
-        ("GaussianModel(dataset", "ModelPool[args.prune_method](dataset"),
-        ("gaussians.oneupSHdegree()", "gaussians.oneupSHdegree(opt, iteration)"),
-        ("scene.cameras_extent, largest)", "scene.cameras_extent, largest, 1, opt=opt)"),
-        (STEP, "            gaussians.prune_after_render(iteration, scene, pipe, render)\n" + STEP),
-        (
-            PARSE,
-            '    parser.add_argument("--prune_method", default="3dgs")\n'
-            + PARSE
-            + '    wandb.init(config=None, project="test").sweep_id\n',
-        ),
-        (
-            "        args.debug_from,\n    )\n",
-            "        args.debug_from,\n    )\n"
-            "    from metrics import evaluate\n    from render import render_sets\n\n"
-            '    render_sets(lp.extract(args), -1, pp.extract(args), False, False)["train"]\n'
-            '    score = evaluate([args.model_path])[args.model_path]["ours_30000"]["PSNR"]\n'
-            '    wandb.log({"psnr": score})\n',
-        ),
-    ],
-}
 POOLED = """from scene.gaussian_model import GaussianModel
 
 
@@ -89,28 +22,78 @@ class {name}(GaussianModel):
 """
 
 
-class LPHost(Host):
+class LPHost(Descendant):
     """Models to choose from, and a script that ends by rendering and evaluating."""
 
-    def write(self, root: Path) -> None:
-        super().write(root)
-        rewrite(root, LP, Pruning)
-        with (root / "scene/gaussian_model.py").open("a") as file:
-            file.write("\n    def prune_after_render(self, *args):\n        pass\n")
-        files = {
-            "scene/gaussian_model_mini_splatting.py": POOLED.format(
-                name="MiniSplatting", score="bw_score"
+    flags = ('"--prune_method", default="3dgs"',)
+    settings = {"f_count": False, "bw_score": False, "mw_score": False, "top_K_dT": None}
+    changes = {
+        RENDERER: [
+            adding("    override_color=None,\n", after="    test=False,\n"),
+            (
+                DRAWN,
+                "    opacity, _ = pc.get_opacity_and_scales_for_train()\n"
+                "    result = GaussianRasterizer(raster_settings=settings)(\n",
             ),
-            "scene/gaussian_model_rad_splat.py": POOLED.format(name="RadSplat", score="mw_score"),
-            "render.py": "from gaussian_renderer import render  # noqa: F401\n\n\n"
-            "def render_sets(dataset, iteration, pipe, skip_train, skip_test):\n"
-            '    return {"train": 1.0, "test": 1.0}\n',
-            "metrics.py": "def evaluate(model_paths):\n    return {p: {} for p in model_paths}\n",
-            "lpipsPyTorch/__init__.py": LPIPS,
-        }
-        for name, text in files.items():
-            (root / name).parent.mkdir(exist_ok=True)
-            (root / name).write_text(text)
+            ("opacities=pc.get_opacity,", "opacities=opacity,"),
+            (
+                "    return {\n",
+                "    image, radii, count, score = result\n    return {\n"
+                '        "gaussians_count": count,\n        "important_score": score,\n',
+            ),
+        ],
+        MODEL: [
+            (
+                "    def oneupSHdegree(self):",
+                "    def prune_after_render(self, *args):\n        pass\n\n"
+                "    def oneupSHdegree(self, opt, iteration):",
+            ),
+            ("extent, max_screen_size):", "extent, max_screen_size, n_split, opt=None):"),
+        ],
+        SCENE: [
+            adding(
+                "from scene.gaussian_model import GaussianModel\n",
+                after="from scene.gaussian_model_mini_splatting import MiniSplatting\n"
+                "from scene.gaussian_model_rad_splat import RadSplat\n",
+            ),
+            adding(
+                "class Scene:\n",
+                before='ModelPool = {"3dgs": GaussianModel, "mini_splatting": MiniSplatting, '
+                '"rad_splat": RadSplat}\n\n\n',
+            ),
+        ],
+        TRAIN: [
+            adding("import torch\n", after="import wandb\n"),
+            ("from scene import GaussianModel, Scene\n", "from scene import ModelPool, Scene\n"),
+            ("GaussianModel(dataset", "ModelPool[args.prune_method](dataset"),
+            ("gaussians.oneupSHdegree()", "gaussians.oneupSHdegree(opt, iteration)"),
+            ("scene.cameras_extent, largest)", "scene.cameras_extent, largest, 1, opt=opt)"),
+            adding(
+                STEP,
+                before="            gaussians.prune_after_render(iteration, scene, pipe, render)\n",
+            ),
+            adding(PARSE, after='    wandb.init(config=None, project="test").sweep_id\n'),
+            adding(
+                "        args.debug_from,\n    )\n",
+                after="    from metrics import evaluate\n    from render import render_sets\n\n"
+                '    render_sets(lp.extract(args), -1, pp.extract(args), False, False)["train"]\n'
+                '    score = evaluate([args.model_path])[args.model_path]["ours_30000"]["PSNR"]\n'
+                '    wandb.log({"psnr": score})\n',
+            ),
+        ],
+    }
+    added = Pruning
+    files = {
+        "scene/gaussian_model_mini_splatting.py": POOLED.format(
+            name="MiniSplatting", score="bw_score"
+        ),
+        "scene/gaussian_model_rad_splat.py": POOLED.format(name="RadSplat", score="mw_score"),
+        "render.py": "from gaussian_renderer import render  # noqa: F401\n\n\n"
+        "def render_sets(dataset, iteration, pipe, skip_train, skip_test):\n"
+        '    return {"train": 1.0, "test": 1.0}\n',
+        "metrics.py": "def evaluate(model_paths):\n    return {p: {} for p in model_paths}\n",
+        "lpipsPyTorch/__init__.py": LPIPS,
+    }
 
     def actions(self):
         return {

@@ -1,14 +1,11 @@
 """A miniature 3DGS-MCMC: the demo's host with what the method adds, from its public interface."""
 
-import inspect
-from pathlib import Path
 from types import SimpleNamespace
 
 import torch
 
-from fragprune_plugins.testing import Chance, Host
-from fragprune_plugins.testing.host import prune
-from fragprune_plugins.testing.rewriting import rewrite
+from fragprune_plugins.testing.host import Chance, prune
+from miniatures.family import BACKWARD, MODEL, PARSE, TRAIN, Descendant, adding
 
 args = SimpleNamespace()  # the host's training loop reads its own script's global of this name
 
@@ -142,71 +139,46 @@ def wander(gaussians, xyz_lr):
     gaussians._xyz.add_(noise * gaussians.get_scaling.square())
 
 
-CHANGES = {
-    "arguments/__init__.py": [
-        ("        self.eval = False\n", "        self.eval = False\n        self.cap_max = -1\n"),
-        (
-            "        self.random_background = False\n",
-            "        self.random_background = False\n"
-            "        self.noise_lr = 5e5\n"
-            "        self.scale_reg = 0.01\n"
-            "        self.opacity_reg = 0.01\n",
-        ),
-    ],
-    "gaussian_renderer/__init__.py": [
-        (
-            "    image, radii = GaussianRasterizer(raster_settings=settings)(\n",
-            "    rasterizer = GaussianRasterizer(raster_settings=settings)\n"
-            "    image, radii, is_used = rasterizer(\n",
-        ),
-        ('        "radii": radii,\n', '        "radii": radii,\n        "is_used": is_used,\n'),
-    ],
-    "scene/gaussian_model.py": [
-        (
-            "from utils.sh_utils import RGB2SH\n",
-            "from utils.reloc_utils import compute_relocation_cuda\n"
-            "from utils.sh_utils import RGB2SH\n",
-        )
-    ],
-    "train.py": [
-        (
-            "    first_iter = 0\n",
-            "    if dataset.cap_max == -1:\n        sys.exit()\n    first_iter = 0\n",
-        ),
-        ("        gaussians.update_learning", "        xyz_lr = gaussians.update_learning"),
-        (
-            "        loss.backward()\n",
-            "        loss = loss + regularisers(gaussians)\n        loss.backward()\n",
-        ),
-        ("                densify(iteration", "                move_in(iteration"),
-        (
-            "zero_grad(set_to_none=True)\n",
-            "zero_grad(set_to_none=True)\n                wander(gaussians, xyz_lr)\n",
-        ),
-        (
-            "    args = parser.parse_args()\n",
-            '    parser.add_argument("--config")\n'
-            "    args = parser.parse_args()\n"
-            "    if args.config:\n"
-            "        vars(args).update(json.loads(Path(args.config).read_text()))\n",
-        ),
-        ("import random\n", "import json\nimport random\n"),
-    ],
-}
-
-
-class MCMCHost(Host):
+class MCMCHost(Descendant):
     """Relocation, addition and noise in place of densification."""
 
     routine = ("relocate", "add", "another band")
-
-    def write(self, root: Path) -> None:
-        super().write(root)
-        rewrite(root, CHANGES, Added)
-        (root / "utils" / "reloc_utils.py").write_text(RELOCATION_MODULE)
-        added = "\n\n".join(inspect.getsource(f) for f in (regularisers, move_in, wander))
-        text = (root / "train.py").read_text()
-        (root / "train.py").write_text(text.replace("if __name__", added + "\n\nif __name__"))
+    options = {
+        "Loading": {"cap_max": -1},
+        "Optimization": {"noise_lr": 5e5, "scale_reg": 0.01, "opacity_reg": 0.01},
+    }
+    flags = ('"--config"',)
+    values = ("is_used",)
+    changes = {
+        MODEL: [
+            adding(
+                "from utils.sh_utils import RGB2SH\n",
+                before="from utils.reloc_utils import compute_relocation_cuda\n",
+            )
+        ],
+        TRAIN: [
+            adding(
+                "    first_iter = 0\n",
+                before="    if dataset.cap_max == -1:\n        sys.exit()\n",
+            ),
+            ("        gaussians.update_learning", "        xyz_lr = gaussians.update_learning"),
+            adding(BACKWARD, before="        loss = loss + regularisers(gaussians)\n"),
+            ("                densify(iteration", "                move_in(iteration"),
+            adding(
+                "zero_grad(set_to_none=True)\n",
+                after="                wander(gaussians, xyz_lr)\n",
+            ),
+            adding(
+                PARSE,
+                after="    if args.config:\n"
+                "        vars(args).update(json.loads(Path(args.config).read_text()))\n",
+            ),
+            adding("import random\n", before="import json\n"),
+        ],
+    }
+    functions = (regularisers, move_in, wander)
+    added = Added
+    files = {"utils/reloc_utils.py": RELOCATION_MODULE}
 
     def step(self, model, camera, iteration, background):
         rate = model.update_learning_rate(iteration)

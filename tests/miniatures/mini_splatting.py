@@ -1,6 +1,5 @@
 """A miniature Mini-Splatting: the demo's host with what the method adds, from its interface."""
 
-import inspect
 import random
 from pathlib import Path
 from types import SimpleNamespace
@@ -8,8 +7,20 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 
-from fragprune_plugins.testing.host import Chance, Host
+from fragprune_plugins.testing.host import Chance
 from fragprune_plugins.testing.rewriting import changed
+from miniatures.family import (
+    DRAWN,
+    MODEL,
+    PARSE,
+    RADII,
+    RENDERER,
+    TRAIN,
+    Descendant,
+    adding,
+    insert,
+    parsing,
+)
 
 args = SimpleNamespace()  # the host's scripts hold their options under this name
 
@@ -113,8 +124,9 @@ PATH = (
     "import numpy as np\nimport torch\nsys.path.append(str(Path(__file__).resolve().parents[1]))\n"
     "from arguments",
 )
+METRIC = '"--imp_metric", required=True'
+ENDS = "    args.test_iterations.append(args.iterations)\n"
 OWN = [
-    PATH,
     (
         "from gaussian_renderer import render\n",
         "from gaussian_renderer import render_depth, render_imp\nfrom lpipsPyTorch import lpips\n",
@@ -128,32 +140,24 @@ OWN = [
         "blur = grow(iteration, opt, gaussians, scene, package, pipe, background, blur)\n"
         "            simplify(iteration, dataset, opt, gaussians, scene, pipe, background)\n",
     ),
-    (
-        "    waiting, smooth",
-        "    blur = torch.zeros(gaussians.get_xyz.shape[0])\n    waiting, smooth",
-    ),
-    (
+    adding("    waiting, smooth", before="    blur = torch.zeros(gaussians.get_xyz.shape[0])\n"),
+    adding(
         "        total += psnr(image, camera.original_image.cuda()).item()\n",
-        "        total += psnr(image, camera.original_image.cuda()).item()\n"
-        "        evaluate(image, camera.original_image)\n",
+        after="        evaluate(image, camera.original_image)\n",
     ),
-    (
-        "    args = parser.parse_args()\n",
-        '    parser.add_argument("--simp_iteration1", type=int, default=15_000)\n'
-        '    parser.add_argument("--simp_iteration2", type=int, default=20_000)\n'
-        '    parser.add_argument("--num_depth", type=int, default=3_500_000)\n'
-        '    parser.add_argument("--depth_interval", type=int, default=5_000)\n'
-        '    parser.add_argument("--sampling_factor", type=float, default=0.5)\n'
-        '    parser.add_argument("--imp_metric", required=True)\n'
-        "    args = parser.parse_args()\n    args.test_iterations.append(args.iterations)\n",
+    parsing(
+        '"--simp_iteration1", type=int, default=15_000',
+        '"--simp_iteration2", type=int, default=20_000',
+        '"--num_depth", type=int, default=3_500_000',
+        '"--depth_interval", type=int, default=5_000',
+        '"--sampling_factor", type=float, default=0.5',
+        METRIC,
     ),
+    adding(PARSE, after=ENDS),
 ]
 DENSE = [
-    ('    parser.add_argument("--imp_metric", required=True)\n', ""),
-    (
-        "    args.test_iterations.append",
-        "    args.simp_iteration1 = args.densify_until_iter\n    args.test_iterations.append",
-    ),
+    (parsing(METRIC)[1], PARSE),
+    adding(ENDS, before="    args.simp_iteration1 = args.densify_until_iter\n"),
 ]
 LPIPS = '''"""A metric whose weights are elsewhere."""
 from urllib.error import URLError
@@ -217,31 +221,36 @@ if __name__ == "__main__":
 '''
 
 
-class MiniSplattingHost(Host):
+class MiniSplattingHost(Descendant):
     """Splits by mask, new points, and simplification."""
 
     routine = ("densify by mask", "new points", "simplify", "reset opacity", "another band")
+    changes = {TRAIN: [PATH]}
+    added = Added
+    files = {"ms_c/run.py": COMPRESSION, "lpipsPyTorch/__init__.py": LPIPS}
 
     def write(self, root: Path) -> None:
         super().write(root)
-        renderer = root / "gaussian_renderer" / "__init__.py"
-        names = "import GaussianRasterizationSettings, GaussianRasterizer\n"
+        renderer, names = (
+            root / RENDERER,
+            "import GaussianRasterizationSettings, GaussianRasterizer\n",
+        )
         text = changed(renderer.read_text(), [(f"from diff_gaussian_rasterization {names}", "")])
         head, body = text.split("def render(")
-        begin = "    screenspace = torch.zeros_like("
 
         def function(name, package, changes=()):
-            lazy = (begin, f"    from {package} {names}\n{begin}")
+            lazy = adding(
+                "    screenspace = torch.zeros_like(", before=f"    from {package} {names}"
+            )
             return "\n\ndef " + changed(f"{name}({body}", [lazy, *changes])
 
-        call = "    image, radii = GaussianRasterizer(raster_settings=settings)(\n"
         tail = body[body.index("    return {\n") :]
         scores = ("accum_weights", "area_proj", "area_max")
         five = [
-            (call, f"    image, radii, {', '.join(scores)} = GaussianRasterizer(settings)(\n"),
-            ('"radii": radii,\n', "".join(f'"{n}": {n},\n        ' for n in ("radii", *scores))),
+            (DRAWN, f"    image, radii, {', '.join(scores)} = GaussianRasterizer(settings)(\n"),
+            adding(RADII, after="".join(f'        "{n}": {n},\n' for n in scores)),
         ]
-        depth = [(call, "    return GaussianRasterizer(settings).render_depth(\n"), (tail, "")]
+        depth = [(DRAWN, "    return GaussianRasterizer(settings).render_depth(\n"), (tail, "")]
         scoring = "diff_gaussian_rasterization_ms"
         renderer.write_text(
             head.rstrip()
@@ -249,28 +258,18 @@ class MiniSplattingHost(Host):
             + function("render_imp", scoring, five)
             + function("render_depth", scoring, depth)
         )
-        model = root / "scene" / "gaussian_model.py"
+        model = root / MODEL
         text = model.read_text()
-        split = text[
-            text.index("    def densify_and_split(") : text.index("    def densify_and_prune(")
-        ]
-        added = "".join(inspect.getsourcelines(Added)[0][2:])
-        model.write_text(f"{text}\n{added}\n{changed(split, MASKED)}")
-        train = (root / "train.py").read_text()
-        functions = (clock, grow, importance, simplify, evaluate)
-        own = "\n\n".join(inspect.getsource(f) for f in functions)
-        ms = changed(train, OWN).replace("if __name__", own + "\n\nif __name__")
-        scripts = {
-            "gs/train.py": changed(train, [PATH]),
-            "ms/train.py": ms,
-            "ms_d/train.py": changed(ms, DENSE),
-            "ms_c/run.py": COMPRESSION,
-            "lpipsPyTorch/__init__.py": LPIPS,
-        }
-        for name, text in scripts.items():
-            (root / name).parent.mkdir(exist_ok=True)
-            (root / name).write_text(text)
-        (root / "train.py").unlink()
+        begin, end = (text.index(f"    def densify_and_{each}(") for each in ("split", "prune"))
+        model.write_text(f"{text}\n{changed(text[begin:end], MASKED)}")
+        train = root / TRAIN
+        for variant, changes in {"gs": (), "ms": OWN, "ms_d": (*OWN, *DENSE)}.items():
+            script = root / variant / TRAIN
+            script.parent.mkdir()
+            script.write_text(changed(train.read_text(), changes))
+            if changes:
+                insert(script, clock, grow, importance, simplify, evaluate)
+        train.unlink()
 
     def actions(self):
         return {

@@ -9,8 +9,7 @@ import numpy as np
 import torch
 from plyfile import PlyData, PlyElement
 
-from fragprune_plugins.testing.host import Host
-from fragprune_plugins.testing.rewriting import rewrite
+from miniatures.family import MODEL, RENDERER, STEP, TRAIN, Descendant, adding
 
 
 class Added:
@@ -115,81 +114,7 @@ class Added:
         self.filter_3D = torch.tensor(column, dtype=torch.float, device="cuda")
 
 
-CHANGES = {
-    "arguments/__init__.py": [
-        (
-            "        self.eval = False\n",
-            "        self.eval = False\n"
-            "        self._kernel_size = 0.1\n"
-            "        self.ray_jitter = False\n",
-        )
-    ],
-    "gaussian_renderer/__init__.py": [
-        ("    bg_color: torch.Tensor,\n", "    bg_color: torch.Tensor,\n    kernel_size: float,\n"),
-        ("    override_color=None,\n", "    override_color=None,\n    subpixel_offset=None,\n"),
-        (
-            "        bg=bg_color,\n",
-            "        kernel_size=kernel_size,\n"
-            "        subpixel_offset=subpixel_offset,\n"
-            "        bg=bg_color,\n",
-        ),
-        (
-            "    settings = Gauss",
-            "    size = int(viewpoint_camera.image_height), int(viewpoint_camera.image_width), 2\n"
-            "    if subpixel_offset is None:\n"
-            '        subpixel_offset = torch.zeros(size, device="cuda")\n'
-            "    settings = Gauss",
-        ),
-        ("scales=pc.get_scaling,", "scales=pc.get_scaling_with_3D_filter,"),
-        ("opacities=pc.get_opacity,", "opacities=pc.get_opacity_with_3D_filter,"),
-    ],
-    "scene/gaussian_model.py": [("import numpy as np\n", "import math\n\nimport numpy as np\n")],
-    "train.py": [
-        ("import torch\n", "import open3d as o3d  # noqa: F401\nimport torch\n"),
-        (
-            "    background = torch.tensor(",
-            "    gaussians.compute_3D_filter(cameras=scene.getTrainCameras())\n"
-            "    background = torch.tensor(",
-        ),
-        (
-            "        package = render(camera, gaussians, pipe, bg)\n",
-            "        size = camera.image_height, camera.image_width, 2\n"
-            '        jitter = torch.rand(size, device="cuda") - 0.5\n'
-            "        jitter = jitter if dataset.ray_jitter else None\n"
-            "        package = render(\n"
-            "            camera,\n"
-            "            gaussians,\n"
-            "            pipe,\n"
-            "            bg,\n"
-            "            kernel_size=dataset.kernel_size,\n"
-            "            subpixel_offset=jitter,\n"
-            "        )\n",
-        ),
-        ("render, (pipe, background))", "render, (pipe, background, dataset.kernel_size))"),
-        (
-            "scene.cameras_extent, largest)\n",
-            "scene.cameras_extent, largest)\n"
-            "        gaussians.compute_3D_filter(cameras=scene.getTrainCameras())\n",
-        ),
-        (
-            "            if iteration < opt.iterations:\n",
-            "            elif iteration % 5 == 0 and iteration < opt.iterations - 5:\n"
-            "                gaussians.compute_3D_filter(cameras=scene.getTrainCameras())\n"
-            "            if iteration < opt.iterations:\n",
-        ),
-    ],
-    "render.py": [
-        ("pipeline, background)[", "pipeline, background, kernel_size)["),
-        ("gaussians, pipeline, background):", "gaussians, pipeline, background, kernel_size):"),
-        (
-            "gaussians, pipeline, background)\n",
-            "gaussians, pipeline, background, dataset.kernel_size)\n",
-        ),
-        ('folder / "renders"', 'folder / "test_preds_1"'),
-        ('folder / "gt"', 'folder / "gt_1"'),
-    ],
-}
-
+FILTER = "gaussians.compute_3D_filter(cameras=scene.getTrainCameras())\n"
 FUSE = """import sys
 from pathlib import Path
 
@@ -208,14 +133,57 @@ gaussians.save_fused_ply(args.output_ply)
 """
 
 
-class MipHost(Host):
+class MipHost(Descendant):
     """How to drive it: filters are as old as the last rows they were computed for."""
 
-    def write(self, root: Path) -> None:
-        """The demo's host, changed where Mip-Splatting is otherwise."""
-        super().write(root)
-        rewrite(root, CHANGES, Added)
-        (root / "create_fused_ply.py").write_text(FUSE)
+    options = {"Loading": {"_kernel_size": 0.1, "ray_jitter": False}}
+    settings = {"subpixel_offset": None}
+    changes = {
+        RENDERER: [
+            adding("    bg_color: torch.Tensor,\n", after="    kernel_size: float,\n"),
+            adding("        bg=bg_color,\n", before="        kernel_size=kernel_size,\n"),
+            adding(
+                "    settings = Gauss",
+                before="    if subpixel_offset is None:\n"
+                "        size = viewpoint_camera.image_height, viewpoint_camera.image_width, 2\n"
+                '        subpixel_offset = torch.zeros(size, device="cuda")\n',
+            ),
+            ("scales=pc.get_scaling,", "scales=pc.get_scaling_with_3D_filter,"),
+            ("opacities=pc.get_opacity,", "opacities=pc.get_opacity_with_3D_filter,"),
+        ],
+        MODEL: [adding("import numpy as np\n", before="import math\n\n")],
+        TRAIN: [
+            adding("import torch\n", before="import open3d as o3d  # noqa: F401\n"),
+            adding("    background = torch.tensor(", before=f"    {FILTER}"),
+            (
+                "        package = render(camera, gaussians, pipe, bg)\n",
+                "        size = camera.image_height, camera.image_width, 2\n"
+                '        jitter = torch.rand(size, device="cuda") - 0.5\n'
+                "        how = {'kernel_size': dataset.kernel_size}\n"
+                "        how['subpixel_offset'] = jitter if dataset.ray_jitter else None\n"
+                "        package = render(camera, gaussians, pipe, bg, **how)\n",
+            ),
+            ("render, (pipe, background))", "render, (pipe, background, dataset.kernel_size))"),
+            adding("scene.cameras_extent, largest)\n", after=f"        {FILTER}"),
+            adding(
+                STEP,
+                before="            elif iteration % 5 == 0 and iteration < opt.iterations - 5:\n"
+                f"                {FILTER}",
+            ),
+        ],
+        "render.py": [
+            ("pipeline, background)[", "pipeline, background, kernel_size)["),
+            ("gaussians, pipeline, background):", "gaussians, pipeline, background, kernel_size):"),
+            (
+                "gaussians, pipeline, background)\n",
+                "gaussians, pipeline, background, dataset.kernel_size)\n",
+            ),
+            ('folder / "renders"', 'folder / "test_preds_1"'),
+            ('folder / "gt"', 'folder / "gt_1"'),
+        ],
+    }
+    added = Added
+    files = {"create_fused_ply.py": FUSE}
 
     def refresh(self, model: Any) -> None:
         """As the training loop does after every change of rows."""

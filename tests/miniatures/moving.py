@@ -4,12 +4,14 @@ import copy
 import inspect
 from argparse import ArgumentParser
 from importlib import import_module
+from textwrap import indent
 from types import SimpleNamespace
 
 import torch
 
-from fragprune_plugins.testing.host import FAINT, Host
-from fragprune_plugins.testing.rewriting import changed, rewrite, without
+from fragprune_plugins.testing.host import FAINT
+from fragprune_plugins.testing.rewriting import changed
+from miniatures.family import MODEL, RADII, RENDERER, SCENE, TRAIN, Descendant, adding
 
 
 class Added:
@@ -216,46 +218,7 @@ class deform_network(nn.Module):
         return xyz + moved["xyz"], scaling + moved["scaling"], turned, opacity, shs
 '''
 
-RENDERER = '''"""One view of the model, at its moment in the fine phase."""
-
-import math
-
-import torch
-from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer
-
-
-def render(
-    viewpoint_camera,
-    pc,
-    pipe,
-    bg_color,
-    scaling_modifier=1.0,
-    override_color=None,
-    stage="fine",
-    cam_type=None,
-):
-    screenspace = torch.zeros_like(pc.get_xyz, requires_grad=True) + 0
-    if screenspace.requires_grad:
-        screenspace.retain_grad()
-    if cam_type != "PanopticSports":
-        settings = GaussianRasterizationSettings(
-            image_height=int(viewpoint_camera.image_height),
-            image_width=int(viewpoint_camera.image_width),
-            tanfovx=math.tan(viewpoint_camera.FoVx / 2),
-            tanfovy=math.tan(viewpoint_camera.FoVy / 2),
-            bg=bg_color,
-            scale_modifier=scaling_modifier,
-            viewmatrix=viewpoint_camera.world_view_transform,
-            projmatrix=viewpoint_camera.full_proj_transform,
-            sh_degree=pc.active_sh_degree,
-            campos=viewpoint_camera.camera_center,
-            prefiltered=False,
-            debug=pipe.debug,
-        )
-        time = viewpoint_camera.time
-    else:
-        settings, time = viewpoint_camera["camera"], viewpoint_camera["time"]
-    now = torch.tensor(time).repeat(len(pc.get_xyz), 1)
+DEFORMED = """    now = torch.tensor(time).repeat(len(pc.get_xyz), 1)
     given = (pc.get_xyz, pc._scaling, pc._rotation, pc._opacity, pc.get_features)
     if "fine" in stage:
         given = pc._deformation(*given, now)
@@ -271,14 +234,10 @@ def render(
         rotations=pc.rotation_activation(rotation),
         cov3D_precomp=None,
     )
-    return {
-        "render": image,
-        "viewspace_points": screenspace,
-        "visibility_filter": radii > 0,
-        "radii": radii,
-        "depth": depth,
-    }
-'''
+"""
+CHOICE = """    else:
+        settings, time = viewpoint_camera["camera"], viewpoint_camera["time"]
+"""
 
 
 class Timed:
@@ -382,83 +341,88 @@ MERGE = """    args.save_iterations.append(args.iterations)
                 if hasattr(args, key):
                     setattr(args, key, value)
 """
-OPTIONS = """        self.random_background = False
-        self.coarse_iterations = 6
-        self.batch_size = 2
-        self.deformation_lr_init = 0.002
-        self.deformation_lr_final = 0.0002
-        self.grid_lr_init = 0.01
-        self.grid_lr_final = 0.001
-        self.time_smoothness_weight = 0.01
-        self.nan_at = -1
-"""
 LOADED = "            gaussians.load_ply(self._ply(self.loaded_iter))\n"
-IMPORT = "from scene.deformation import deform_network\n"
-CHANGES = {
-    "scene/gaussian_model.py": [
-        ("from torch import nn\n", "from torch import nn\n" + IMPORT),
-    ],
-    "scene/__init__.py": [
-        (LOADED, LOADED + "            folder = Path(self._ply(self.loaded_iter)).parent\n"
-         "            gaussians.load_model(folder)\n"),
-        ("self.cameras_extent)\n\n", "self.cameras_extent, 0)\n\n"),
-    ],
-    "arguments/__init__.py": [
-        ("        self.random_background = False\n", OPTIONS),
-    ],
-    "render.py": [
-        ("    with torch.no_grad():\n        gaussians = GaussianModel(dataset.sh_degree)\n",
-         "    with torch.no_grad():\n"
-         "        hidden = Namespace(net_width=6, resolution=5)\n"
-         "        gaussians = GaussianModel(dataset.sh_degree, hidden)\n"),
-        ("import ArgumentParser\n", "import ArgumentParser, Namespace\n"),
-        ("    for index, view in enumerate(tqdm(views, desc=f\"Rendering {name}\")):\n",
-         "    for index, view in enumerate(tqdm(views, desc=f\"Rendering {name}\")):\n"
-         "        view.time = index / len(views)\n"),
-    ],
-}  # fmt: skip
-
-
+VIEWS = '    for index, view in enumerate(tqdm(views, desc=f"Rendering {name}")):\n'
 IDLE = ("timenet", "opacity_deform", "shs_deform")
 """Parts of the network that its defaults leave unused."""
 
 
-class MovingHost(Host):
+class MovingHost(Descendant):
     """Small Gaussians, and a smaller network."""
 
     routine = ("densify", "prune faint", "reset opacity", "another band")
     moment = 0.3
+    options = {
+        "Optimization": {
+            "coarse_iterations": 6,
+            "batch_size": 2,
+            "deformation_lr_init": 0.002,
+            "deformation_lr_final": 0.0002,
+            "grid_lr_init": 0.01,
+            "grid_lr_final": 0.001,
+            "time_smoothness_weight": 0.01,
+            "nan_at": -1,
+        }
+    }
+    flags = (
+        *('"--configs", type=str, default=""', '"--expname", type=str, default=""'),
+        *('"--net_width", type=int, default=6', '"--resolution_t", type=int, default=5'),
+    )
+    changes = {
+        MODEL: [
+            adding("from torch import nn\n", after="from scene.deformation import deform_network\n")
+        ],
+        SCENE: [
+            adding(
+                LOADED,
+                after="            folder = Path(self._ply(self.loaded_iter)).parent\n"
+                "            gaussians.load_model(folder)\n",
+            ),
+            ("self.cameras_extent)\n\n", "self.cameras_extent, 0)\n\n"),
+        ],
+        TRAIN: [
+            adding("import random\n", before="import copy\nimport os\n"),
+            ("    args.save_iterations.append(args.iterations)\n", MERGE),
+        ],
+        "render.py": [
+            (
+                "        gaussians = GaussianModel(dataset.sh_degree)\n",
+                "        hidden = Namespace(net_width=6, resolution=5)\n"
+                "        gaussians = GaussianModel(dataset.sh_degree, hidden)\n",
+            ),
+            ("import ArgumentParser\n", "import ArgumentParser, Namespace\n"),
+            adding(VIEWS, after="        view.time = index / len(views)\n"),
+        ],
+    }
+    functions = (Timed, scene_reconstruction, training)
+    added = Added
+    files = {"scene/deformation.py": NETWORK}
+    gone = {
+        MODEL: ("densify_and_prune",),
+        SCENE: ("save",),
+        TRAIN: ("training", "densify", "training_report"),
+    }
 
     def write(self, root):
         super().write(root)
-        (root / "scene" / "deformation.py").write_text(NETWORK)
-        (root / "gaussian_renderer" / "__init__.py").write_text(RENDERER)
-        model = root / "scene" / "gaussian_model.py"
-        model.write_text(without(model.read_text(), ["densify_and_prune"]))
-        rewrite(root, CHANGES, Added)
-        scene = root / "scene" / "__init__.py"
-        text = without(scene.read_text(), ["save"])
-        scene.write_text(text + "\n" + "".join(inspect.getsource(Entry.save)))
-        script = root / "train.py"
-        text = without(script.read_text(), ["training", "densify", "training_report"])
-        head, main = text.split('if __name__ == "__main__":\n')
-        begun = main.index("    training(\n")
-        main = changed(
-            main[:begun], [("    args.save_iterations.append(args.iterations)\n", MERGE)]
-        )
-        flags = (
-            '    parser.add_argument("--configs", type=str, default="")\n'
-            '    parser.add_argument("--expname", type=str, default="")\n'
-            '    parser.add_argument("--net_width", type=int, default=6)\n'
-            '    parser.add_argument("--resolution_t", type=int, default=5)\n'
-            "    args = parser.parse_args()\n"
-        )
-        main = changed(main, [("    args = parser.parse_args()\n", flags)])
-        body = "\n\n".join(map(inspect.getsource, (Timed, scene_reconstruction, training)))
-        script.write_text(
-            f'import copy\nimport os\n{head}\n\n{body}\n\nif __name__ == "__main__":\n{main}'
-            "    training(lp.extract(args), op.extract(args), pp.extract(args))\n"
-        )
+        scene, script, renderer = root / SCENE, root / TRAIN, root / RENDERER
+        scene.write_text(scene.read_text() + "\n" + inspect.getsource(Entry.save))
+        text = script.read_text()
+        begun = text.index("    training(\n")
+        call = "    training(lp.extract(args), op.extract(args), pp.extract(args))\n"
+        script.write_text(text[:begun] + call)
+        text = renderer.read_text()
+        marks = ("    settings = Gauss", "    shape = {", "    return {")
+        begin, middle, end = (text.index(each) for each in marks)
+        known = '    if cam_type != "PanopticSports":\n'
+        known += indent(text[begin:middle] + "    time = viewpoint_camera.time\n", " " * 4)
+        text = text[:begin] + known + CHOICE + DEFORMED + text[end:]
+        more = '    stage="fine",\n    cam_type=None,\n'
+        changes = [
+            adding("    override_color=None,\n", after=more),
+            adding(RADII, after='        "depth": depth,\n'),
+        ]
+        renderer.write_text(changed(text, changes))
 
     # -- driving, which works on a real checkout too ---------------------------------------------
 

@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from fragprune_plugins.testing.host import Host, densify_and_prune
-from fragprune_plugins.testing.rewriting import rewrite
+from fragprune_plugins.testing.host import densify_and_prune
+from miniatures.family import MODEL, PARSE, RENDERER, SCENE, TRAIN, Descendant, adding
 
 PACKAGE = "submodules/diff_gaussian_rasterization"
+CLASSES = "import GaussianRasterizationSettings, GaussianRasterizer\n"
+MODES = ("ours", "ours_new", "paper_random", "c2f", "white_bg")
 
 
 class Added:
@@ -76,107 +78,6 @@ def replaced_points(args, args_dict):
     return cloud
 
 
-CHANGES = {
-    "gaussian_renderer/__init__.py": [
-        (
-            "from diff_gaussian_rasterization import GaussianRasterizationSettings, "
-            "GaussianRasterizer\n",
-            "from submodules.diff_gaussian_rasterization.diff_gaussian_rasterization import (\n"
-            "    GaussianRasterizationSettings,\n    GaussianRasterizer,\n)\n",
-        ),
-        ("    override_color=None,\n", "    override_color=None,\n    low_pass=0.3,\n"),
-        ("debug=pipe.debug,\n", "debug=pipe.debug,\n        low_pass=low_pass,\n"),
-        (
-            "    image, radii = GaussianRasterizer(raster_settings=settings)(\n",
-            "    rasterizer = GaussianRasterizer(raster_settings=settings)\n"
-            "    image, radii, depth = rasterizer(\n",
-        ),
-        ('        "radii": radii,\n', '        "radii": radii,\n        "depth": depth,\n'),
-    ],
-    "scene/gaussian_model.py": [
-        (
-            "    def __init__(self, sh_degree: int):\n",
-            "    def __init__(self, sh_degree: int, divide_ratio):\n"
-            "        self.divide_ratio = divide_ratio\n",
-        ),
-        ("spread / (0.8 * N)", "spread / (self.divide_ratio * N)"),
-    ],
-    "scene/__init__.py": [
-        ("(1.0,)\n    ):", "(1.0,), args_dict=None\n    ):"),
-        (
-            "create_from_pcd(read_points(args), self",
-            "create_from_pcd(replaced_points(args, args_dict), self",
-        ),
-        (
-            "\n\nclass Scene:",
-            "\nfrom utils.graphics_utils import BasicPointCloud\n\n\n"
-            + inspect.getsource(replaced_points)
-            + "\n\nclass Scene:",
-        ),
-    ],
-    "train.py": [
-        ("import torch\n", "import numpy as np\nimport torch\nimport wandb  # noqa: F401\n"),
-        ("    debug_from,\n):", "    debug_from,\n    args_dict,\n):"),
-        (
-            "    prepare_output_and_logger(dataset)\n",
-            "    dataset.model_path = dataset.model_path or f\"./output/{args_dict['exp_name']}\"\n"
-            "    prepare_output_and_logger(dataset)\n"
-            '    ratio = 0.7 if args_dict["ours"] or args_dict["ours_new"] else 0.8\n'
-            '    opt.densify_until_iter += args_dict["warmup_iter"]\n'
-            "    low_pass = None\n",
-        ),
-        ("GaussianModel(dataset.sh_degree)", "GaussianModel(dataset.sh_degree, ratio)"),
-        ("Scene(dataset, gaussians)", "Scene(dataset, gaussians, args_dict=args_dict)"),
-        (
-            "        gaussians.update_learning_rate(iteration)\n",
-            "        rate(iteration, gaussians, args_dict)\n",
-        ),
-        (
-            "        package = render(camera, gaussians, pipe, bg)\n",
-            "        low_pass = dilation(iteration, opt, camera, gaussians, args_dict, low_pass)\n"
-            "        package = render(camera, gaussians, pipe, bg, low_pass=low_pass)\n",
-        ),
-        (
-            "dataset, gaussians, scene, package)\n            if",
-            "dataset, gaussians, scene, package, args_dict)\n            if",
-        ),
-        ("gaussians, scene, package):", "gaussians, scene, package, args_dict):"),
-        (
-            "(threshold, 0.005, scene.cameras_extent, largest)\n",
-            "(\n            threshold,\n            0.005,\n            scene.cameras_extent,\n"
-            "            largest,\n            N=2,\n"
-            '            abe_split=iteration <= args_dict["warmup_iter"],\n        )\n',
-        ),
-        (
-            "    args = parser.parse_args()\n",
-            "    for flag in ('ours', 'ours_new', 'paper_random', 'c2f', 'white_bg'):\n"
-            '        parser.add_argument(f"--{flag}", action="store_true")\n'
-            '    parser.add_argument("--exp_name")\n'
-            '    parser.add_argument("--num_gaussians", type=int, default=1_000_000)\n'
-            '    parser.add_argument("--warmup_iter", type=int, default=0)\n'
-            '    parser.add_argument("--train_from", default="random")\n'
-            '    parser.add_argument("--c2f_every_step", type=float, default=1000)\n'
-            '    parser.add_argument("--c2f_max_lowpass", type=float, default=300)\n'
-            "    args = parser.parse_args()\n"
-            "    args.eval, args.white_background = True, args.white_bg\n"
-            "    if args.ours or args.ours_new:\n"
-            "        args.c2f, args.c2f_every_step, args.num_gaussians = True, 10, 40\n"
-            "    if args.ours_new:\n"
-            "        args.warmup_iter = 12\n",
-        ),
-        ("        args.debug_from,\n    )", "        args.debug_from,\n        vars(args),\n    )"),
-        (
-            "\n\nif __name__",
-            "\n\n"
-            + inspect.getsource(dilation)
-            + "\n\n"
-            + inspect.getsource(rate)
-            + "\n\nif __name__",
-        ),
-    ],
-    "render.py": [("GaussianModel(dataset.sh_degree)", "GaussianModel(dataset.sh_degree, 0.8)")],
-}
-
 BINDING = '''"""Binds what its neighbour compiles."""
 
 from ..setup import _C
@@ -187,17 +88,90 @@ class GaussianRasterizer:
 '''
 
 
-class RainHost(Host):
+class RainHost(Descendant):
     """How to drive it; splits throw a copy far out, as they do while it warms up."""
 
-    def write(self, root: Path) -> None:
-        """The demo's host, changed where RAIN-GS is otherwise; nothing compiles here."""
-        super().write(root)
-        rewrite(root, CHANGES, Added)
-        package = root / PACKAGE / "diff_gaussian_rasterization"
-        package.mkdir(parents=True)
-        (package / "__init__.py").write_text(BINDING)
-        (root / PACKAGE / "setup.py").write_text('raise ImportError("no compiler here")\n')
+    flags = (
+        *(f'"--{flag}", action="store_true"' for flag in MODES),
+        '"--exp_name"',
+        '"--num_gaussians", type=int, default=1_000_000',
+        '"--warmup_iter", type=int, default=0',
+        '"--train_from", default="random"',
+        '"--c2f_every_step", type=float, default=1000',
+        '"--c2f_max_lowpass", type=float, default=300',
+    )
+    settings = {"low_pass": 0.3}
+    values = ("depth",)
+    changes = {
+        RENDERER: [
+            (
+                f"from diff_gaussian_rasterization {CLASSES}",
+                f"from {PACKAGE.replace('/', '.')}.diff_gaussian_rasterization {CLASSES}",
+            )
+        ],
+        MODEL: [
+            (
+                "    def __init__(self, sh_degree: int):\n",
+                "    def __init__(self, sh_degree: int, divide_ratio):\n"
+                "        self.divide_ratio = divide_ratio\n",
+            ),
+            ("spread / (0.8 * N)", "spread / (self.divide_ratio * N)"),
+        ],
+        SCENE: [
+            ("(1.0,)\n    ):", "(1.0,), args_dict=None\n    ):"),
+            ("from_pcd(read_points(args), self", "from_pcd(replaced_points(args, args_dict), self"),
+            adding(
+                "\n\nclass Scene:",
+                before="\nfrom utils.graphics_utils import BasicPointCloud\n\n\n"
+                + inspect.getsource(replaced_points),
+            ),
+        ],
+        TRAIN: [
+            adding("import torch\n", before="import numpy as np\n", after="import wandb\n"),
+            adding("    debug_from,\n", after="    args_dict,\n"),
+            adding(
+                "    prepare_output_and_logger(dataset)\n",
+                before="    dataset.model_path = dataset.model_path or "
+                "f\"./output/{args_dict['exp_name']}\"\n",
+                after='    ratio = 0.7 if args_dict["ours"] or args_dict["ours_new"] else 0.8\n'
+                '    opt.densify_until_iter += args_dict["warmup_iter"]\n'
+                "    low_pass = None\n",
+            ),
+            ("GaussianModel(dataset.sh_degree)", "GaussianModel(dataset.sh_degree, ratio)"),
+            ("Scene(dataset, gaussians)", "Scene(dataset, gaussians, args_dict=args_dict)"),
+            ("gaussians.update_learning_rate(iteration)", "rate(iteration, gaussians, args_dict)"),
+            (
+                "package = render(camera, gaussians, pipe, bg)\n",
+                "low_pass = dilation(iteration, opt, camera, gaussians, args_dict, low_pass)\n"
+                "        package = render(camera, gaussians, pipe, bg, low_pass=low_pass)\n",
+            ),
+            ("scene, package)\n            if", "scene, package, args_dict)\n            if"),
+            ("gaussians, scene, package):", "gaussians, scene, package, args_dict):"),
+            (
+                "(threshold, 0.005, scene.cameras_extent, largest)\n",
+                "(\n            *(threshold, 0.005, scene.cameras_extent, largest),\n"
+                '            N=2, abe_split=iteration <= args_dict["warmup_iter"],\n        )\n',
+            ),
+            adding(
+                PARSE,
+                after="    args.eval, args.white_background = True, args.white_bg\n"
+                "    if args.ours or args.ours_new:\n"
+                "        args.c2f, args.c2f_every_step, args.num_gaussians = True, 10, 40\n"
+                "    if args.ours_new:\n"
+                "        args.warmup_iter = 12\n",
+            ),
+            adding("        args.debug_from,\n", after="        vars(args),\n"),
+        ],
+        "render.py": [
+            ("GaussianModel(dataset.sh_degree)", "GaussianModel(dataset.sh_degree, 0.8)")
+        ],
+    }
+    functions = (dilation, rate)
+    added = Added
+    files = {
+        f"{PACKAGE}/diff_gaussian_rasterization/__init__.py": BINDING,
+        f"{PACKAGE}/setup.py": 'raise ImportError("no compiler here")\n',
+    }
 
     def new_model(self, degree: int) -> Any:
         """With the divisor of a split's scales."""

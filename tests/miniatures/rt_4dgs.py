@@ -1,15 +1,15 @@
 """A miniature RT-4DGS: the demo's host with space and time, from the method's interface."""
 
 import copy
-import inspect
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 
 import torch
 
-from fragprune_plugins.testing.host import Chance, Host
-from fragprune_plugins.testing.rewriting import changed, rewrite, without
+from fragprune_plugins.testing.host import Chance
+from fragprune_plugins.testing.rewriting import changed
+from miniatures.family import MODEL, PARSE, RENDERER, SCENE, TRAIN, Descendant, adding
 
 ATTRIBUTES = {
     "xyz": "_xyz",
@@ -22,6 +22,17 @@ ATTRIBUTES = {
     "scaling_t": "_scaling_t",
     "rotation_r": "_rotation_r",
 }
+
+
+IN_TIME = """        sh_degree_t=pc.active_sh_degree_t,
+        timestamp=now,
+        time_duration=pc.time_duration[1] - pc.time_duration[0],
+        rot_4d=pc.rot_4d,
+        gaussian_dim=pc.gaussian_dim,
+        force_sh_3d=pc.force_sh_3d,
+"""
+ANSWER = {"radii": "everyone", "depth": "depth", "alpha": "alpha", "flow": "flow"}
+OMEGA = "from omegaconf import OmegaConf\nfrom omegaconf.dictconfig import DictConfig\n"
 
 
 class Added:
@@ -227,41 +238,7 @@ class GaussianRasterizer:
         ...
 '''
 
-RENDERER = '''"""One view of the model at one moment."""
-
-import math
-
-import torch
-
-from .diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer
-
-
-def render(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0, override_color=None):
-    screenspace = torch.zeros_like(pc.get_xyz, requires_grad=True) + 0
-    if screenspace.requires_grad:
-        screenspace.retain_grad()
-    now = viewpoint_camera.timestamp
-    settings = GaussianRasterizationSettings(
-        image_height=int(viewpoint_camera.image_height),
-        image_width=int(viewpoint_camera.image_width),
-        tanfovx=math.tan(viewpoint_camera.FoVx / 2),
-        tanfovy=math.tan(viewpoint_camera.FoVy / 2),
-        bg=torch.zeros(3) if pipe.env_map_res else bg_color,
-        scale_modifier=scaling_modifier,
-        viewmatrix=viewpoint_camera.world_view_transform,
-        projmatrix=viewpoint_camera.full_proj_transform,
-        sh_degree=pc.active_sh_degree,
-        sh_degree_t=pc.active_sh_degree_t,
-        campos=viewpoint_camera.camera_center,
-        timestamp=now,
-        time_duration=pc.time_duration[1] - pc.time_duration[0],
-        rot_4d=pc.rot_4d,
-        gaussian_dim=pc.gaussian_dim,
-        force_sh_3d=pc.force_sh_3d,
-        prefiltered=False,
-        debug=pipe.debug,
-    )
-    given = {"means3D": pc.get_xyz, "means2D": screenspace, "opacities": pc.get_opacity}
+SLICED = """    given = {"means3D": pc.get_xyz, "means2D": screenspace, "opacities": pc.get_opacity}
     given.update(shs=pc.get_features, flow_2d=torch.zeros_like(pc.get_xyz[:, :2]))
     if pc.gaussian_dim == 4:
         given["ts"] = pc.get_t
@@ -293,16 +270,15 @@ def render(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0, override_
         image = image + (1 - alpha) * pc.env_map
     everyone = radii.new_zeros(mask.shape)
     everyone[mask] = radii
-    return {
-        "render": image,
-        "viewspace_points": screenspace,
-        "visibility_filter": everyone > 0,
-        "radii": everyone,
-        "depth": depth,
-        "alpha": alpha,
-        "flow": flow,
-    }
-'''
+"""
+RENDERING = [
+    ("from diff_gaussian", "from .diff_gaussian"),
+    adding("    settings = Gauss", before="    now = viewpoint_camera.timestamp\n"),
+    ("bg=bg_color,", "bg=torch.zeros(3) if pipe.env_map_res else bg_color,"),
+    adding("sh_degree=pc.active_sh_degree,\n", after=IN_TIME),
+    ("radii > 0", "everyone > 0"),
+    ('"radii": radii,\n', "".join(f'"{n}": {v},\n        ' for n, v in ANSWER.items())),
+]
 
 args = SimpleNamespace()  # the host's script holds its options under this name
 
@@ -392,25 +368,6 @@ SAVE = """    def save(self, iteration):
         torch.save((self.gaussians.capture(), iteration), path)
 
 """
-SCENE = [
-    ("import numpy as np\n", "import numpy as np\nimport torch\n"),
-    ("    def getTrainCameras(", SAVE + "    def getTrainCameras("),
-]
-THRESHOLD = "        self.densify_grad_threshold = 0.0002\n"
-DEBUG = "        self.debug = False\n"
-OPTIONS = [
-    (
-        THRESHOLD,
-        THRESHOLD
-        + "        self.sh_increase_interval = 1000\n        self.lambda_opa_mask = 0.0\n",
-    ),
-    (DEBUG, DEBUG + "        self.env_map_res = 0\n        self.eval_shfs_4d = False\n"),
-]
-OMEGA = "from omegaconf import OmegaConf\nfrom omegaconf.dictconfig import DictConfig\n"
-IMPORTS = [
-    ("import random\n", "import copy\nimport random\n"),
-    ("import torch\n", "import torch\n" + OMEGA),
-]
 MAIN = """    parser.add_argument("--config")
     parser.add_argument("--gaussian_dim", type=int, default=3)
     parser.add_argument("--time_duration", nargs=2, type=float, default=[-0.5, 0.5])
@@ -433,34 +390,44 @@ MAIN = """    parser.add_argument("--config")
 """
 
 
-def change(path: Path, changes: list[tuple[str, str]], *gone: str) -> Path:
-    """Rewrite a module without some of its functions, and changed."""
-    path.write_text(changed(without(path.read_text(), gone), changes))
-    return path
-
-
-class RT4DGSHost(Host):
+class RT4DGSHost(Descendant):
     """Space and time; no PLY, several views a step, and a gradient that the loop reads."""
 
-    lacks = {"model file": "it has no PLY: its checkpoints are its models"}  # noqa: RUF012
+    lacks = {"model file": "it has no PLY: its checkpoints are its models"}
     rot_4d = True
     python = False
+    options = {
+        "Pipeline": {"env_map_res": 0, "eval_shfs_4d": False},
+        "Optimization": {"sh_increase_interval": 1000, "lambda_opa_mask": 0.0},
+    }
+    changes = {
+        MODEL: [adding("\n\nclass GaussianModel:\n", before=f"\n\nATTRIBUTES = {ATTRIBUTES}\n")],
+        SCENE: [
+            adding("import numpy as np\n", after="import torch\n"),
+            adding("    def getTrainCameras(", before=SAVE),
+        ],
+        TRAIN: [
+            adding("import random\n", before="import copy\n"),
+            adding("import torch\n", after=OMEGA),
+        ],
+    }
+    functions = (Timed, training)
+    added = Added
+    files = {"gaussian_renderer/diff_gaussian_rasterization.py": RASTERIZER}
+    gone = {
+        MODEL: ("save_ply", "load_ply", "construct_list_of_attributes"),
+        SCENE: ("save",),
+        TRAIN: ("training",),
+    }
 
     def write(self, root: Path) -> None:
         super().write(root)
-        (root / "gaussian_renderer" / "__init__.py").write_text(RENDERER)
-        (root / "gaussian_renderer" / "diff_gaussian_rasterization.py").write_text(RASTERIZER)
-        own = ("save_ply", "load_ply", "construct_list_of_attributes")
-        begin = "\n\nclass GaussianModel:\n"
-        names = [(begin, f"\n\nATTRIBUTES = {ATTRIBUTES}\n{begin}")]
-        change(root / "scene" / "gaussian_model.py", names, *own)
-        rewrite(root, {}, Added)
-        change(root / "scene" / "__init__.py", SCENE, "save")
-        change(root / "arguments" / "__init__.py", OPTIONS)
-        train = change(root / "train.py", IMPORTS, "training")
-        text, _ = train.read_text().split("    args = parser.parse_args()\n")
-        loop = "\n\n".join(inspect.getsource(each) for each in (Timed, training))
-        train.write_text(text.replace("if __name__", loop + "\n\nif __name__") + MAIN)
+        renderer, train = root / RENDERER, root / TRAIN
+        text = renderer.read_text()
+        begin, end = (text.index(each) for each in ("    shape = {", "    return {"))
+        renderer.write_text(changed(text[:begin] + SLICED + text[end:], RENDERING))
+        text, _ = train.read_text().split(PARSE)
+        train.write_text(text + MAIN)
 
     def new_model(self, degree):
         model = import_module("scene.gaussian_model").GaussianModel

@@ -1,13 +1,11 @@
 """A miniature 2D Gaussian Splatting: the demo's host with what the method adds."""
 
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import torch
 
-from fragprune_plugins.testing.host import Host
-from fragprune_plugins.testing.rewriting import rewrite
+from miniatures.family import BACKWARD, MODEL, RADII, RENDERER, TRAIN, Descendant, adding
 
 MAPS = """
 
@@ -50,60 +48,47 @@ def depth_to_normal(view, depth):
     return torch.nn.functional.pad(normal, (0, 0, 1, 1, 1, 1))
 '''
 
-CHANGES = {
-    "arguments/__init__.py": [
-        (
-            "        self.debug = False\n",
-            "        self.debug = False\n        self.depth_ratio = 0.0\n",
-        ),
-        (
-            "        self.lambda_dssim = 0.2\n",
-            "        self.lambda_dssim = 0.2\n"
-            "        self.lambda_dist = 100.0\n"
-            "        self.lambda_normal = 0.05\n",
-        ),
-    ],
-    "gaussian_renderer/__init__.py": [
-        ("from diff_gaussian_rasterization import", "from diff_surfel_rasterization import"),
-        (
-            "from utils.sh_utils import eval_sh\n",
-            "from utils.point_utils import depth_to_normal\nfrom utils.sh_utils import eval_sh\n",
-        ),
-        ("    image, radii = Gauss", "    image, radii, allmap = Gauss"),
-        (
-            '        "radii": radii,\n    }\n',
-            '        "radii": radii,\n    } | surface(viewpoint_camera, allmap, pipe)\n' + MAPS,
-        ),
-    ],
-    "scene/gaussian_model.py": [
-        ("(scales)[:, None].repeat(1, 3)", "(scales)[:, None].repeat(1, 2)"),
-        (
-            "        offset = (turn @ torch.normal(torch.zeros_like(spread), spread)",
-            "        flat = torch.nn.functional.pad(spread, (0, 1))\n"
-            "        offset = (turn @ torch.normal(torch.zeros_like(flat), flat)",
-        ),
-    ],
-    "train.py": [
-        (
-            "        loss.backward()\n",
-            "        error = 1 - (package['rend_normal'] * package['surf_normal']).sum(dim=0)\n"
-            "        loss = loss + (opt.lambda_normal if iteration > 7 else 0) * error.mean()\n"
-            "        far = package['rend_dist'].mean()\n"
-            "        loss = loss + (opt.lambda_dist if iteration > 3 else 0) * far\n"
-            "        loss.backward()\n",
-        )
-    ],
-}
 
-
-class SurfelHost(Host):
+class SurfelHost(Descendant):
     """How to drive it: two scales, and losses of depths and normals."""
 
-    def write(self, root: Path) -> None:
-        """The demo's host, changed where 2D Gaussian Splatting is otherwise."""
-        super().write(root)
-        rewrite(root, CHANGES)
-        (root / "utils" / "point_utils.py").write_text(POINTS)
+    options = {
+        "Pipeline": {"depth_ratio": 0.0},
+        "Optimization": {"lambda_dist": 100.0, "lambda_normal": 0.05},
+    }
+    changes = {
+        RENDERER: [
+            ("from diff_gaussian_rasterization import", "from diff_surfel_rasterization import"),
+            adding(
+                "from utils.sh_utils import eval_sh\n",
+                before="from utils.point_utils import depth_to_normal\n",
+            ),
+            ("    image, radii = Gauss", "    image, radii, allmap = Gauss"),
+            (
+                f"{RADII}    }}\n",
+                f"{RADII}    }} | surface(viewpoint_camera, allmap, pipe)\n{MAPS}",
+            ),
+        ],
+        MODEL: [
+            ("(scales)[:, None].repeat(1, 3)", "(scales)[:, None].repeat(1, 2)"),
+            (
+                "        offset = (turn @ torch.normal(torch.zeros_like(spread), spread)",
+                "        flat = torch.nn.functional.pad(spread, (0, 1))\n"
+                "        offset = (turn @ torch.normal(torch.zeros_like(flat), flat)",
+            ),
+        ],
+        TRAIN: [
+            adding(
+                BACKWARD,
+                before="        drawn, seen = package['rend_normal'], package['surf_normal']\n"
+                "        error = 1 - (drawn * seen).sum(dim=0)\n"
+                "        loss = loss + (opt.lambda_normal if iteration > 7 else 0) * error.mean()\n"
+                "        far = package['rend_dist'].mean()\n"
+                "        loss = loss + (opt.lambda_dist if iteration > 3 else 0) * far\n",
+            )
+        ],
+    }
+    files = {"utils/point_utils.py": POINTS}
 
     def fill(self, model: Any, cloud: Any) -> None:
         """With rotations that a seed tells: the host begins with any."""

@@ -1,0 +1,96 @@
+"""What miniatures of the family share: the demo's host, otherwise where a descendant says so."""
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+from fragprune_plugins.testing.host import Host
+from fragprune_plugins.testing.rewriting import Changes, changed, rewrite, without
+
+RENDERER, MODEL = "gaussian_renderer/__init__.py", "scene/gaussian_model.py"
+TRAIN, OPTIONS, SCENE = "train.py", "arguments/__init__.py", "scene/__init__.py"
+DRAWN = "    image, radii = GaussianRasterizer(raster_settings=settings)(\n"
+PARSE = "    args = parser.parse_args()\n"
+BACKWARD = "        loss.backward()\n"
+STEP = "            if iteration < opt.iterations:\n"
+RADII = '        "radii": radii,\n'
+
+
+def adding(passage: str, *, before: str = "", after: str = "") -> tuple[str, str]:
+    """The change that keeps a passage, and puts text before or after it."""
+    return passage, before + passage + after
+
+
+def parsing(*flags: str) -> tuple[str, str]:
+    """The change of a script that adds flags, given as ``add_argument`` takes them."""
+    return adding(PARSE, before="".join(f"    parser.add_argument({flag})\n" for flag in flags))
+
+
+class Descendant(Host):
+    """A host written from its differences.
+
+    Attributes:
+        options: further options, by the title of their group.
+        flags: further flags of ``train.py``, as ``add_argument`` takes them.
+        settings: names of what ``render`` takes besides, and passes to the rasterizer's settings.
+        values: names of what the rasterizer returns after the radii; ``render`` hands them on.
+        changes: passages of files, and what replaces them.
+        functions: put into ``train.py``, where changes call them.
+        added: methods of GaussianModel, as ``rewrite`` takes them.
+        files: whole files by their paths.
+        gone: names of functions and methods that the host does not have, by file.
+    """
+
+    options: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
+    flags: ClassVar[Sequence[str]] = ()
+    settings: ClassVar[Mapping[str, Any]] = {}
+    values: ClassVar[Sequence[str]] = ()
+    changes: ClassVar[Mapping[str, Changes]] = {}
+    functions: ClassVar[Sequence[Callable[..., Any]]] = ()
+    added: ClassVar[type | None] = None
+    files: ClassVar[Mapping[str, str]] = {}
+    gone: ClassVar[Mapping[str, Sequence[str]]] = {}
+
+    def write(self, root: Path) -> None:
+        """The demo's host, changed."""
+        super().write(root)
+        for name, functions in self.gone.items():
+            (root / name).write_text(without((root / name).read_text(), functions))
+        rewrite(root, self._usual())
+        rewrite(root, self.changes, self.added)
+        insert(root / TRAIN, *self.functions)
+        for name, text in self.files.items():
+            file = root / name
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(text)
+
+    def _usual(self) -> dict[str, Changes]:
+        """The changes that most descendants make, by file."""
+        options = [
+            adding(
+                f'        super().__init__(parser, "{title}"',
+                before="".join(f"        self.{name} = {value!r}\n" for name, value in own.items()),
+            )
+            for title, own in self.options.items()
+        ]
+        taken = "".join(f"    {name}={value!r},\n" for name, value in self.settings.items())
+        passed = "".join(f"        {name}={name},\n" for name in self.settings)
+        renderer = [
+            adding("    override_color=None,\n", after=taken),
+            adding("debug=pipe.debug,\n", after=passed),
+        ]
+        if self.values:
+            call = (
+                "    rasterizer = GaussianRasterizer(raster_settings=settings)\n"
+                f"    image, radii, {', '.join(self.values)} = rasterizer(\n"
+            )
+            returned = "".join(f'        "{name}": {name},\n' for name in self.values)
+            renderer += [(DRAWN, call), adding(RADII, after=returned)]
+        return {OPTIONS: options, TRAIN: [parsing(*self.flags)], RENDERER: renderer}
+
+
+def insert(script: Path, *functions: Callable[..., Any]) -> None:
+    """Put functions before a script's main part."""
+    own = "".join(inspect.getsource(each) + "\n\n" for each in functions)
+    script.write_text(changed(script.read_text(), [adding("if __name__", before=own)]))
