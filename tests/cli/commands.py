@@ -37,3 +37,11 @@ def drawing(data: Path, path: Path, cameras: Path, out: Path) -> dict[str, tuple
 
 
 DRAWING = ("finetune", "render", "profile", "compare", "bench")
+
+
+def fails(*arguments: object, says: str | tuple[str, ...], code: int = 2) -> None:
+    """A command fails with this exit code, and says this on stderr."""
+    result = run(*arguments)
+    assert result.exit_code == code, result.output
+    for each in (says,) if isinstance(says, str) else says:
+        assert each in result.stderr

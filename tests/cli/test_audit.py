@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 import torch
-from cli.commands import run, run_json
+from cli.commands import fails, run, run_json
 from finetune import tiny
 from PIL import Image
 
@@ -141,7 +141,6 @@ def test_a_pruned_model_says_what_its_thresholds_save(tmp_path):
 
 @pytest.mark.parametrize("side", ["--orbit", "--inside"])
 def test_two_sources_of_cameras_are_refused(model, tmp_path, side):
-    result = run("audit", model, "--data", tmp_path, side, "--out", tmp_path / "out")
-    assert result.exit_code == 2
-    assert f"--data with {side}" in result.stderr
+    asked = ("audit", model, "--data", tmp_path, side, "--out", tmp_path / "out")
+    fails(*asked, says=f"--data with {side}")
     assert not (tmp_path / "out").exists()

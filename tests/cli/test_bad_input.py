@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from cli.commands import run
+from cli.commands import fails, run
 from finetune import tiny
 
 from fragprune_plugins.files import sidecar
@@ -103,9 +103,7 @@ def test_the_model_itself_is_no_output(scene, command):
     before = path.read_bytes()
     more = ("--data", data) if command == "finetune" else ()
     for out in (path, path.with_suffix(".PLY")):  # one sidecar for both
-        result = run(command, path, *more, "--out", out)
-        assert result.exit_code == 2
-        assert "the model's name" in result.stderr
+        fails(command, path, *more, "--out", out, says="the model's name")
     assert path.read_bytes() == before
 
 
@@ -119,9 +117,7 @@ def test_the_model_itself_is_no_output(scene, command):
     ],
 )
 def test_a_file_is_not_written_under_the_name_of_another_kind(words, wrong, kind):
-    result = run(*words, wrong)
-    assert result.exit_code == 2
-    assert f"'{wrong}' does not end with {kind}" in result.stderr
+    fails(*words, wrong, says=f"'{wrong}' does not end with {kind}")
 
 
 def test_a_failed_write_touches_nothing(scene, monkeypatch):
@@ -132,9 +128,7 @@ def test_a_failed_write_touches_nothing(scene, monkeypatch):
 
     monkeypatch.setattr("plyfile.PlyData.write", full)
     arguments = ("finetune", path, "--data", data, "--out", out, "--iters", 2)
-    result = run(*arguments)
-    assert result.exit_code == 1
-    assert "No space left" in result.stderr
+    fails(*arguments, says="No space left", code=1)
     assert untouched(out)
 
 
@@ -200,6 +194,5 @@ def test_a_name_that_no_file_can_have_is_no_model(scene, tmp_path, command):
     names = ["x" * 300] * (2 if command == "compare" else 1)
     more = [] if command == "export" else ["--data", scene[0]]
     more += ["--iters", 1] if command == "finetune" else []
-    result = run(command, *names, *more, "--out", tmp_path / "new.ply")
-    assert result.exit_code == 1
-    assert "cannot be opened (File name too long)" in result.stderr
+    asked = (command, *names, *more, "--out", tmp_path / "new.ply")
+    fails(*asked, says="cannot be opened (File name too long)", code=1)

@@ -5,7 +5,7 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
-from cli.commands import run, run_json
+from cli.commands import fails, run, run_json
 
 from fragprune_plugins import __version__
 from fragprune_plugins.workbench import bridge
@@ -47,9 +47,8 @@ def test_an_unknown_viewer_is_a_usage_error_that_names_the_known():
 
 def test_a_folder_that_cannot_be_made_is_a_stated_error(tmp_path):
     (tmp_path / "taken").write_text("")
-    failed = run("bridge", "spark", "--out", tmp_path / "taken" / "website")
-    assert failed.exit_code == 1
-    assert str(tmp_path / "taken") in failed.stderr
+    asked = ("bridge", "spark", "--out", tmp_path / "taken" / "website")
+    fails(*asked, says=str(tmp_path / "taken"), code=1)
 
 
 @pytest.mark.parametrize("module", ["no.such.package", "json", "sys:exit"])
@@ -57,6 +56,4 @@ def test_a_broken_bridge_is_named(monkeypatch, module):
     broken = EntryPoint("mine", module, bridge.GROUP)
     monkeypatch.setattr(bridge, "offered", lambda group: {"mine": broken})
     for words in ((), ("mine",)):
-        failed = run("bridge", *words)
-        assert failed.exit_code == 1
-        assert "[plugin] fragprune.bridges mine" in failed.stderr
+        fails("bridge", *words, says="[plugin] fragprune.bridges mine", code=1)

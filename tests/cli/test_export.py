@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from cli.commands import run, run_json
+from cli.commands import fails, run, run_json
 from finetune import tiny
 
 import fragprune_plugins as fp
@@ -111,32 +111,26 @@ def test_a_gaussian_without_its_like_gets_no_cutoff(tmp_path, pruned, change):
     write_ply(tmp_path / "edited.ply", replace(model, **{change: values}))
     out = tmp_path / "out.ply"
     words = (tmp_path / "pruned.ply", "--out", out)
-    result = run("export", tmp_path / "edited.ply", *words)
-    assert result.exit_code == 1
-    assert "[row-mismatch]" in result.stderr
-    assert "2 of 60 Gaussians" in result.stderr
+    asked = ("export", tmp_path / "edited.ply", *words)
+    fails(*asked, says=("[row-mismatch]", "2 of 60 Gaussians"), code=1)
     assert not out.exists()
 
 
 def test_a_model_without_cutoffs_has_none_to_give(tmp_path, pruned):
     write_ply(tmp_path / "plain.ply", pruned.untruncated())
     words = (tmp_path / "plain.ply", "--out", tmp_path / "out.ply")
-    result = run("export", tmp_path / "pruned.ply", *words)
-    assert result.exit_code == 1
-    assert "plain.ply: a model without cutoffs" in result.stderr
+    asked = ("export", tmp_path / "pruned.ply", *words)
+    fails(*asked, says="plain.ply: a model without cutoffs", code=1)
 
 
 def test_cutoffs_cannot_be_given_back_and_left_out_at_once(tmp_path, pruned):
     path = tmp_path / "pruned.ply"
-    result = run("export", path, path, "--no-truncation", "--out", tmp_path / "out.ply")
-    assert result.exit_code == 2
-    assert "PRUNED with --no-truncation" in result.stderr
+    asked = ("export", path, path, "--no-truncation", "--out", tmp_path / "out.ply")
+    fails(*asked, says="PRUNED with --no-truncation")
 
 
 def test_the_model_that_gives_cutoffs_is_not_overwritten(tmp_path, pruned):
     path, before = tmp_path / "pruned.ply", (tmp_path / "pruned.ply").read_bytes()
     write_ply(tmp_path / "edited.ply", edited(pruned, torch.arange(9)))
-    result = run("export", tmp_path / "edited.ply", path, "--out", path)
-    assert result.exit_code == 2
-    assert "the model's name" in result.stderr
+    fails("export", tmp_path / "edited.ply", path, "--out", path, says="the model's name")
     assert path.read_bytes() == before

@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import pytest
 import torch
-from cli.commands import run, run_json
+from cli.commands import fails, run, run_json
 from finetune import tiny
 
 import fragprune_plugins as fp
 from fragprune_plugins.files import records, sidecar
 from fragprune_plugins.files.ply import read_ply, write_ply
 from fragprune_plugins.learning.pressure import LEAST_PRESSURE
-from fragprune_plugins.workbench.finetune import faster, loop
+from fragprune_plugins.workbench.finetune import loop
 from fragprune_plugins.workbench.finetune.finished import advise_own_pictures, describe_untruncated
 from fragprune_plugins.workbench.goals import parse_goal
 
@@ -181,9 +181,7 @@ def test_what_shows_beside_the_photographs_stays(scene, tmp_path, more):
 def test_what_a_model_itself_can_spare_is_not_known(scene, tmp_path):
     data, path, _ = scene
     arguments = ("finetune", path, "--data", data, "--out", tmp_path / "out.ply", "--self")
-    result = run(*arguments, "--keep", "auto")
-    assert result.exit_code == 2
-    assert "--keep auto" in result.stderr
+    fails(*arguments, "--keep", "auto", says="--keep auto")
     report = run_json(*arguments, "--keep", 0.9, "--iters", 3)
     assert report["after"]["gaussians"] == 54
 
@@ -232,12 +230,7 @@ def test_a_control_truncates_nothing_and_is_quoted_by_the_same_training(scene, t
 
 
 def test_a_target_time_says_what_was_reached(scene, tmp_path, monkeypatch):
-    def timed(work, device):
-        outputs = work()
-        return outputs, 0.02 + 2e-3 * float(outputs.fragments_per_pixel)
-
-    monkeypatch.setattr(faster, "timed", timed)
-    monkeypatch.setattr(faster, "_SECONDS", 0.0)
+    tiny.exact_clock(monkeypatch)
     data, path, _ = scene
     arguments = ("finetune", path, "--data", data, "--out", tmp_path / "out.ply", "--iters", 20)
     report = run_json(*arguments, "--target-time", 1.2)
@@ -269,18 +262,11 @@ def test_a_bound_on_the_loss_trains_the_control_and_names_the_views(scene, tmp_p
 def test_sigterm_saves_at_once_and_leaves_with_143(scene, tmp_path, monkeypatch):
     data, path, _ = scene
     out, before = tmp_path / "out.ply", signal.getsignal(signal.SIGTERM)
-    loss, calls = loop.photometric_loss, []
-
-    def photometric(*args):
-        calls.append(1)
-        if len(calls) == 4:
-            signal.raise_signal(signal.SIGTERM)
-        return loss(*args)
 
     def measured(*args, **kwargs):
         raise AssertionError("whoever sends SIGTERM does not wait for this")
 
-    monkeypatch.setattr(loop, "photometric_loss", photometric)
+    tiny.at_loss(monkeypatch, 4, lambda: signal.raise_signal(signal.SIGTERM))
     monkeypatch.setattr("fragprune_plugins.workbench.figures.evaluate.measure_all", measured)
     result = run("finetune", path, "--data", data, "--out", out, "--iters", 50, "--json")
     assert result.exit_code == 143

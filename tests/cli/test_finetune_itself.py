@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from cli.commands import run, run_json
+from cli.commands import fails, run, run_json
 from finetune import tiny
 
 import fragprune_plugins as fp
@@ -164,9 +164,7 @@ def test_a_single_camera_is_too_few(scene, cameras, tmp_path):
     _, path, _ = scene
     cameras.write_text(json.dumps(json.loads(cameras.read_text())[:1]))
     words = ("--self", "--cameras", cameras, "--out", tmp_path / "out.ply")
-    result = run("finetune", path, *words)
-    assert result.exit_code == 1
-    assert "at least two" in result.stderr
+    fails("finetune", path, *words, says="at least two", code=1)
 
 
 def test_in_python_needs_no_cameras(scene):
@@ -216,9 +214,8 @@ def test_the_command_learns_from_both(scene, tmp_path):
 @pytest.mark.parametrize("value", ["model.ply", "1.5", "0.95", "0"])
 def test_a_share_is_a_number_below_one(scene, value, tmp_path):
     _, path, _ = scene
-    result = run("finetune", path, "--out", tmp_path / "out.ply", "--self", value)
-    assert result.exit_code == 2
-    assert "is no share of the views" in result.stderr
+    asked = ("finetune", path, "--out", tmp_path / "out.ply", "--self", value)
+    fails(*asked, says="is no share of the views")
 
 
 @pytest.mark.parametrize(("line", "target"), [("true", "itself"), ("0.5", "photographs")])

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from cli.commands import fails, run_json
 from cli.commands import finetune_words as words
-from cli.commands import run, run_json
 from finetune.several import command
 
 from fragprune_plugins.errors import DatasetError
@@ -170,18 +170,14 @@ def test_shards_write_and_report_as_one_process_does(scene, tmp_path):
 
 
 def test_one_process_has_nobody_to_share_gaussians_with(scene, tmp_path):
-    result = run(*words(scene, tmp_path / "out.ply", "--shard-gaussians"))
-    assert result.exit_code == 2
-    assert "torchrun" in result.stderr
+    fails(*words(scene, tmp_path / "out.ply", "--shard-gaussians"), says="torchrun")
 
 
 def test_no_launcher_no_rendezvous(scene, tmp_path, monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "2")
     for name in ("RANK", "MASTER_ADDR", "MASTER_PORT"):
         monkeypatch.delenv(name, raising=False)
-    result = run(*words(scene, tmp_path / "out.ply"))
-    assert result.exit_code == 1
-    assert "Start them with torchrun" in result.stderr
+    fails(*words(scene, tmp_path / "out.ply"), says="Start them with torchrun", code=1)
 
 
 OFTEN = """

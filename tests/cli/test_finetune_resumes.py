@@ -6,8 +6,9 @@ import os
 import signal
 
 import pytest
+from cli.commands import fails, run, run_json
 from cli.commands import finetune_words as words
-from cli.commands import run, run_json
+from finetune import tiny
 
 from fragprune_plugins.files.atomic import locked
 from fragprune_plugins.workbench.finetune import loop, resuming
@@ -53,15 +54,7 @@ def test_killed_twice_the_same_command_ends_with_the_same_files(scene, tmp_path)
 def test_ctrl_c_is_gone_on_from_with_the_same_gaussians(scene, tmp_path, monkeypatch):
     whole, out = tmp_path / "whole.ply", tmp_path / "out.ply"
     assert run(*words(scene, whole, "--keep", 0.5)).exit_code == 0
-    loss, calls = loop.photometric_loss, []
-
-    def photometric(*args):
-        calls.append(1)
-        if len(calls) == 7:
-            signal.raise_signal(signal.SIGINT)
-        return loss(*args)
-
-    monkeypatch.setattr(loop, "photometric_loss", photometric)
+    tiny.at_loss(monkeypatch, 7, lambda: signal.raise_signal(signal.SIGINT))
     result = run(*words(scene, out, "--keep", 0.5))
     assert result.exit_code == 130
     assert "The same command goes on from there." in result.stdout
@@ -110,10 +103,7 @@ def test_another_command_is_refused_while_one_is_unfinished(scene, tmp_path):
     out = tmp_path / "out.ply"
     killed(9, *words(scene, out))
     other = words(scene, out, "--pressure", 1e-3)
-    refused = run(*other)
-    assert refused.exit_code == 1
-    assert "[checkpoint]" in refused.stderr
-    assert "with other goal" in refused.stderr
+    fails(*other, says=("[checkpoint]", "with other goal"), code=1)
     assert run_json(*other, "--again")["resumed_at"] == 0
 
 

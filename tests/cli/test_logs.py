@@ -8,7 +8,7 @@ import sys
 from types import SimpleNamespace
 
 import pytest
-from cli.commands import run, run_json
+from cli.commands import fails, run, run_json
 from click.shell_completion import ShellComplete
 from finetune import tiny
 
@@ -130,9 +130,8 @@ def test_a_missing_library_is_a_usage_error_that_says_what_to_install(tmp_path, 
     data, model, _ = tiny.scene(tmp_path)
     monkeypatch.setitem(sys.modules, "wandb", None)
     out = tmp_path / "p.ply"
-    result = run("finetune", model, "--data", data, "--out", out, *WORDS, "--log", "wandb:x")
-    assert result.exit_code == 2
-    assert "fragprune-plugins[wandb]" in result.stderr
+    asked = ("finetune", model, "--data", data, "--out", out, *WORDS, "--log", "wandb:x")
+    fails(*asked, says="fragprune-plugins[wandb]")
     assert not out.exists()
 
 
@@ -165,9 +164,7 @@ def test_a_config_file_gives_the_options(tmp_path):
 
 
 def test_a_config_file_that_is_missing_is_a_usage_error(tmp_path):
-    result = run("run", "--config", tmp_path / "a.toml", "--", "python", "train.py")
-    assert result.exit_code == 2
-    assert "no such file" in result.stderr
+    fails("run", "--config", tmp_path / "a.toml", "--", "python", "train.py", says="no such file")
 
 
 def test_a_shell_completes_commands():
@@ -179,9 +176,7 @@ def test_a_file_that_is_no_log_is_not_begun_anew(tmp_path):
     data, model, _ = tiny.scene(tmp_path)
     before = model.read_bytes()
     words = ("finetune", model, "--data", data, "--out", tmp_path / "p.ply", *WORDS)
-    result = run(*words, "--log", f"csv:{model}")
-    assert result.exit_code == 1
-    assert "a file that is no log" in result.stderr
+    fails(*words, "--log", f"csv:{model}", says="a file that is no log", code=1)
     assert model.read_bytes() == before
 
 

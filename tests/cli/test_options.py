@@ -1,7 +1,7 @@
 """What commands make of words that are misspelt, missing or without effect."""
 
 import pytest
-from cli.commands import run, run_json
+from cli.commands import fails, run, run_json
 from finetune import tiny
 from PIL import Image
 
@@ -9,16 +9,12 @@ from fragprune_plugins.workbench.commands import cli
 
 
 def test_a_misspelt_option_of_run_is_not_the_hosts_command():
-    result = run("run", "--quik", "--", "python", "train.py")
-    assert result.exit_code == 2
-    assert "Did you mean '--quick'?" in result.stderr
+    fails("run", "--quik", "--", "python", "train.py", says="Did you mean '--quick'?")
 
 
 @pytest.mark.parametrize(("word", "meant"), [("dem", "demo"), ("finetun", "finetune")])
 def test_a_misspelt_command_is_guessed(word, meant):
-    result = run(word)
-    assert result.exit_code == 2
-    assert f"Did you mean {meant}?" in result.stderr
+    fails(word, says=f"Did you mean {meant}?")
 
 
 @pytest.mark.parametrize(
@@ -32,10 +28,8 @@ def test_a_misspelt_command_is_guessed(word, meant):
 def test_a_model_that_is_not_there_is_what_is_wrong(name, tmp_path):
     out = tmp_path / "out"
     words = [] if name in ("bench", "compare", "profile", "view") else ["--out", out / "x.ply"]
-    result = run(name, tmp_path / "no.ply", *([tmp_path / "b.ply"] * (name == "compare")), *words)
-    assert result.exit_code == 1
-    assert "[model-file]" in result.stderr
-    assert "no.ply: no such file" in result.stderr
+    asked = (name, tmp_path / "no.ply", *([tmp_path / "b.ply"] * (name == "compare")), *words)
+    fails(*asked, says=("[model-file]", "no.ply: no such file"), code=1)
     assert not out.exists()
 
 
@@ -58,9 +52,7 @@ def test_cameras_of_a_file_are_divided(given, tmp_path):
 def test_options_of_photographs_are_refused_beside_cameras(given, tmp_path, words):
     model, cameras = given
     out = tmp_path / "pictures"
-    result = run("render", model, "--cameras", cameras, "--out", out, *words)
-    assert result.exit_code == 2
-    assert f"{words[0]}" in result.stderr
+    fails("render", model, "--cameras", cameras, "--out", out, *words, says=f"{words[0]}")
     assert not out.exists()
 
 

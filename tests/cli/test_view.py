@@ -6,7 +6,7 @@ import urllib.request
 from threading import Thread
 
 import pytest
-from cli.commands import run, run_json
+from cli.commands import fails, run_json
 from finetune import tiny
 
 from fragprune_plugins.files import records
@@ -38,9 +38,7 @@ def test_a_page_of_somebody_else_is_not_overwritten(cut_scene, tmp_path, name):
     own = tmp_path / "website" / "index.html"
     own.parent.mkdir()
     own.write_text("<!doctype html><title>My site</title>")
-    result = run("view", path, "--out", own.parent / name)
-    assert result.exit_code == 1
-    assert "did not write" in result.stderr
+    fails("view", path, "--out", own.parent / name, says="did not write", code=1)
     assert own.read_text().endswith("My site</title>")
     assert list(own.parent.iterdir()) == [own]
 
@@ -136,6 +134,4 @@ def test_serves_until_ctrl_c(cut_scene, monkeypatch):
     [(("--data", "x", "--cameras", "y"), "--cameras"), (("--port", "70000"), "--port")],
 )
 def test_options_that_do_not_fit(cut_scene, options, words):
-    result = run("view", cut_scene[1], *options)
-    assert result.exit_code == 2
-    assert words in result.stderr
+    fails("view", cut_scene[1], *options, says=words)

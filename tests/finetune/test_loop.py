@@ -146,17 +146,7 @@ def test_the_bar_says_when_it_warms_up(model, dataset, capsys):
 
 
 def test_interrupted(model, dataset, monkeypatch):
-    calls = 0
-
-    def photometric(*args):
-        nonlocal calls
-        calls += 1
-        if calls == 6:
-            raise KeyboardInterrupt
-        return loss(*args)
-
-    loss = loop.photometric_loss
-    monkeypatch.setattr(loop, "photometric_loss", photometric)
+    tiny.at_loss(monkeypatch, 6, KeyboardInterrupt)
     result = finetune(model, dataset, Settings(iterations=50))
     assert result.interrupted
     assert result.progress.steps == 5
@@ -222,20 +212,10 @@ def test_calibration_keeps_the_nearest_end_when_out_of_reach():
     assert calls[-1] > calls[0]
 
 
-def ms_of(outputs) -> float:
-    """What a frame takes on a machine whose clock is exact."""
-    return 0.02 + 1e-3 * outputs.evaluated_per_pixel + 2e-3 * float(outputs.fragments_per_pixel)
-
-
 def test_a_target_time_that_no_threshold_reaches_is_refused_before_any_work(
     model, dataset, monkeypatch
 ):
-    def timed(work, device):
-        outputs = work()
-        return outputs, 1e3 + ms_of(outputs)
-
-    monkeypatch.setattr(faster, "timed", timed)
-    monkeypatch.setattr(faster, "_SECONDS", 0.0)
+    tiny.exact_clock(monkeypatch, base=1e3)
     with pytest.raises(UsageError, match=r"less than 1\.\d\dx"):
         finetune(model, dataset, Settings(iterations=9, goal=Faster(1.5)), engine="cpu")
 

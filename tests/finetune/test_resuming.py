@@ -1,18 +1,18 @@
 """A fine-tuning that was cut off goes on, and ends with the same bits as one that was not."""
 
-import json
 import os
 import signal
 
 import pytest
 import torch
 from finetune import tiny
+from safetensors.torch import save_file
 
 from fragprune_plugins.errors import CheckpointError, OutputError
 from fragprune_plugins.learning.goals import Control, Fewer, Portable, Pressure
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.workbench.finetune import checkpoints as files
-from fragprune_plugins.workbench.finetune import faster, loop, resuming
+from fragprune_plugins.workbench.finetune import resuming
 from fragprune_plugins.workbench.finetune.api import finetune
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
 from fragprune_plugins.workbench.goals import Faster
@@ -32,17 +32,8 @@ def run(model, dataset, settings, path=None, *, cut=None, monkeypatch=None, tell
     options |= {"engine": "cpu", "checkpoints": kept}
     if cut is None:
         return finetune(model, dataset, settings, **options)
-    calls, loss = 0, loop.photometric_loss
-
-    def cutting(*args):
-        nonlocal calls
-        calls += 1
-        if calls == cut:
-            raise Cut
-        return loss(*args)
-
     with monkeypatch.context() as patch:
-        patch.setattr(loop, "photometric_loss", cutting)
+        tiny.at_loss(patch, cut, Cut)
         with pytest.raises(Cut):
             finetune(model, dataset, settings, **options)
     return None
@@ -86,12 +77,7 @@ def test_cut_off_again_and_again_it_ends_as_if_never_cut(
 def test_a_target_time_that_was_cut_off_keeps_what_was_timed(
     model, dataset, tmp_path, monkeypatch, single_thread
 ):
-    def timed(work, device):
-        outputs = work()
-        return outputs, 0.02 + 2e-3 * float(outputs.fragments_per_pixel)
-
-    monkeypatch.setattr(faster, "timed", timed)
-    monkeypatch.setattr(faster, "_SECONDS", 0.0)
+    tiny.exact_clock(monkeypatch)
     settings, path = Settings(iterations=STEPS, goal=Faster(1.2)), tmp_path / "unfinished"
 
     whole = run(model, dataset, settings)
@@ -136,17 +122,8 @@ def test_a_signal_waits_for_the_end_of_its_step_and_is_resumed_from_there(
 
     settings, path = Settings(iterations=STEPS), tmp_path / "out.fragprune-unfinished"
     whole = run(model, dataset, settings)
-    calls, loss = 0, loop.photometric_loss
-
-    def signalled(*args):
-        nonlocal calls
-        calls += 1
-        if calls == 5:
-            os.kill(os.getpid(), number)
-        return loss(*args)
-
     with monkeypatch.context() as patch, sigterm_interrupts():
-        patch.setattr(loop, "photometric_loss", signalled)
+        tiny.at_loss(patch, 5, lambda: os.kill(os.getpid(), number))
         cut = run(model, dataset, settings, path)
     assert cut.interrupted
     assert cut.terminated == (number == signal.SIGTERM)
@@ -196,72 +173,75 @@ def test_another_configuration_is_refused_and_named(
     assert unfinished.read_bytes() == before
 
 
-def spoil(path, how):
-    tensors, values = files.load(path)
-    if how == "cut off":
-        path.write_bytes(path.read_bytes()[:-9])
-    elif how == "empty":
-        path.write_bytes(b"")
-    elif how == "foreign":
-        from safetensors.torch import save_file
-
-        save_file({"logits": torch.zeros(3)}, path)
-    elif how == "a part is missing":
-        files.save(path, {k: v for k, v in tensors.items() if k != "model.opacity"}, values)
-    elif how == "other rows":
-        files.save(path, tensors | {"model.opacity": torch.zeros(3, 1)}, values)
-    elif how.startswith("negative second moments"):
-        name = "exp_avg_sq" + how.removeprefix("negative second moments")
-        files.save(path, tensors | {name: tensors[name] - 1}, values)
-    elif how == "fewer thresholds":
-        few = {key: tensors[key][:5] for key in ("logits", "exp_avg", "exp_avg_sq")}
-        files.save(path, tensors | few, values)
-    elif how == "not a number":
-        from safetensors.torch import save_file
-
-        tensors["exp_avg.opacity"][3] = torch.nan
-        save_file(tensors, path, metadata={"format": files.FORMAT, "values": "{}"})
-    elif how == "words for numbers":
-        files.save(path, tensors, values | {"done": "many"})
-    elif how == "doubles":
-        files.save(path, tensors | {"exp_avg": tensors["exp_avg"].double()}, values)
-    else:
-        name, word = how.split(": ")
-        inner = values["pressure"] if name.startswith("pressure.") else values
-        inner[name.removeprefix("pressure.")] = json.loads(word)
-        files.save(path, tensors, values)
+def truncated(path):
+    path.write_bytes(path.read_bytes()[:-9])
 
 
-@pytest.mark.parametrize(
-    "how",
-    [
-        "cut off",
-        "empty",
-        "foreign",
-        "a part is missing",
-        "other rows",
-        "negative second moments",
-        "negative second moments.opacity",
-        "fewer thresholds",
-        "not a number",
-        "words for numbers",
-        "doubles",
-        "done: 1000",
-        "adam_step: -1",
-        "adam_step: []",
-        "seconds: -1",
-        'steps: "x"',
-        "steps: -1",
-        "_open: null",
-        "_median: {}",
-        "_held: 3",
-        "pressure.observe: 3",
-    ],
-)
+def foreign(path):
+    save_file({"logits": torch.zeros(3)}, path)
+
+
+def not_finite(path):
+    tensors, _ = files.load(path)
+    tensors["exp_avg.opacity"][3] = torch.nan
+    save_file(tensors, path, metadata={"format": files.FORMAT, "values": "{}"})
+
+
+def tensors(change):
+    """Spoil a checkpoint by replacing some of its tensors; None drops one."""
+
+    def spoil(path):
+        known, values = files.load(path)
+        given = known | change(known)
+        files.save(path, {k: v for k, v in given.items() if v is not None}, values)
+
+    return spoil
+
+
+def value(name, word):
+    """Spoil a checkpoint by a value that is another one's, or none."""
+
+    def spoil(path):
+        known, values = files.load(path)
+        *outer, inner = name.split(".")
+        (values[outer[0]] if outer else values)[inner] = word
+        files.save(path, known, values)
+
+    return spoil
+
+
+BROKEN = {
+    "cut off": truncated,
+    "empty": lambda path: path.write_bytes(b""),
+    "foreign": foreign,
+    "not a number": not_finite,
+    "a part is missing": tensors(lambda _: {"model.opacity": None}),
+    "other rows": tensors(lambda _: {"model.opacity": torch.zeros(3, 1)}),
+    "negative second moments": tensors(lambda known: {"exp_avg_sq": known["exp_avg_sq"] - 1}),
+    "and of the opacity": tensors(
+        lambda known: {"exp_avg_sq.opacity": known["exp_avg_sq.opacity"] - 1}
+    ),
+    "fewer thresholds": tensors(
+        lambda known: {key: known[key][:5] for key in ("logits", "exp_avg", "exp_avg_sq")}
+    ),
+    "doubles": tensors(lambda known: {"exp_avg": known["exp_avg"].double()}),
+    "words for numbers": value("done", "many"),
+    "more steps than asked for": value("done", 1000),
+    **{
+        f"{name}: {word}": value(name, word)
+        for name, word in [
+            *(("adam_step", -1), ("adam_step", []), ("seconds", -1), ("steps", "x"), ("steps", -1)),
+            *(("_open", None), ("_median", {}), ("_held", 3), ("pressure.observe", 3)),
+        ]
+    },
+}
+
+
+@pytest.mark.parametrize("how", BROKEN)
 def test_a_broken_checkpoint_is_stated(model, dataset, unfinished, tmp_path, how):
     path = tmp_path / "out.fragprune-unfinished"
     path.write_bytes(unfinished.read_bytes())
-    spoil(path, how)
+    BROKEN[how](path)
     with pytest.raises(CheckpointError) as caught:
         run(model, dataset, Settings(iterations=STEPS), path)
     assert "--again" in caught.value.remedy

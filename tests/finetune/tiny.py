@@ -3,12 +3,14 @@
 import json
 import math
 import struct
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from itertools import count as counting
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 from PIL import Image
 
@@ -17,6 +19,7 @@ from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.ply import write_ply
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs
+from fragprune_plugins.workbench.finetune import faster, loop
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Photograph
 from fragprune_plugins.workbench.scenes.pinhole import Camera
 
@@ -216,3 +219,28 @@ def dataset_in_memory(folder: Path, truth: Model) -> Dataset:
         save_png(path, image)
         shots.append(Photograph(f"view{i:02d}", camera.view(), path))
     return Dataset([s for i, s in enumerate(shots) if i % 8], shots[::8])
+
+
+def at_loss(patch: pytest.MonkeyPatch, number: int, event: Any) -> None:
+    """In the midst of a step of a fine-tuning: raise an exception's class, or call a function."""
+    loss, steps = loop.photometric_loss, counting(1)
+
+    def counted(*args: Any) -> torch.Tensor:
+        if next(steps) == number:
+            if isinstance(event, type):
+                raise event
+            event()
+        return loss(*args)
+
+    patch.setattr(loop, "photometric_loss", counted)
+
+
+def exact_clock(patch: pytest.MonkeyPatch, base: float = 0.02) -> None:
+    """Frames take so many ms, and 0.002 for each fragment of a pixel."""
+
+    def timed(work: Callable[[], Any], device: torch.device) -> tuple[Any, float]:
+        outputs = work()
+        return outputs, base + 2e-3 * float(outputs.fragments_per_pixel)
+
+    patch.setattr(faster, "timed", timed)
+    patch.setattr(faster, "_SECONDS", 0.0)

@@ -8,7 +8,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
-from cli.commands import run, run_json
+from cli.commands import fails, run, run_json
 from finetune import tiny
 
 from fragprune_plugins.files.ply import write_ply
@@ -115,9 +115,7 @@ def test_an_orbit_can_be_pictures(tmp_path, monkeypatch):
 def test_without_the_library_the_message_says_what_to_install(tmp_path, monkeypatch):
     _, model, _ = tiny.scene(tmp_path)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    result = run("render", model, "--orbit", "--out", tmp_path / "a.mp4")
-    assert result.exit_code == 2
-    assert "fragprune-plugins[video]" in result.stderr
+    fails("render", model, "--orbit", "--out", tmp_path / "a.mp4", says="fragprune-plugins[video]")
     assert not (tmp_path / "a.mp4").exists()
 
 
