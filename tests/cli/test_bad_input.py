@@ -108,16 +108,39 @@ def test_the_model_itself_is_no_output(scene, command):
 
 
 @pytest.mark.parametrize(
-    ("words", "wrong", "kind"),
+    ("words", "says"),
     [
-        (("finetune", "m.ply", "--data", "d", "--out"), "pruned.txt", ".ply"),
-        (("finetune", "m.ply", "--data", "d", "--out"), "pruned", ".ply"),
-        (("export", "m.ply", "--out"), "pruned.obj", ".ply"),
-        (("report", "d", "--out"), "page.pdf", ".html"),
+        ("run --quik -- python train.py", "Did you mean '--quick'?"),  # not the host's command
+        ("dem", "Did you mean demo?"),
+        ("finetun", "Did you mean finetune?"),
+        ("bridge babylon", "playcanvas or spark"),
+        ("run --config no.toml -- python train.py", "no such file"),
+        ("run --target-time 1.5 -- train.py", "--target-speedup"),
+        ("run --from-iter 5 -- train.py", "--stage finetune or joint"),
+        ("run --from-iter 5 --stage off -- train.py", "--stage finetune or joint"),
+        ("finetune FILE --self --out out.ply --max-drop 0.1", "--self with --max-drop"),
+        ("finetune FILE --out pruned.txt", "'pruned.txt' does not end with .ply"),
+        ("finetune FILE --out pruned", "'pruned' does not end with .ply"),
+        ("export FILE --out pruned.obj", "'pruned.obj' does not end with .ply"),
+        ("report d --out page.pdf", "'page.pdf' does not end with .html"),
+        ("view FILE --data x --cameras y", "--cameras"),
+        ("view FILE --port 70000", "--port"),
+        *(
+            (f"finetune FILE --out out.ply --self {share}", "is no share of the views")
+            for share in ("model.ply", "1.5", "0.95", "0")
+        ),
+        *(
+            (f"finetune FILE --out out.ply --log {log}", "--log")
+            for log in ("csv", "csv:", "paper:x", ":x", "bar:3")
+        ),
+        *(
+            (f"render FILE --orbit --out a.mp4 --up {up}", "--up")
+            for up in ("1,2", "a,b,c", "0,0,0", "nan,0,1", "inf,0,0")
+        ),
     ],
 )
-def test_a_file_is_not_written_under_the_name_of_another_kind(words, wrong, kind):
-    fails(*words, wrong, says=f"'{wrong}' does not end with {kind}")
+def test_words_that_make_no_sense_are_usage(words, says):
+    fails(*words.replace("FILE", __file__).split(), says=says)
 
 
 def test_a_failed_write_touches_nothing(scene, monkeypatch):

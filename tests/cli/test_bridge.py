@@ -39,12 +39,6 @@ def test_the_module_is_copied_into_a_new_folder(viewer, tmp_path):
     assert "await installCutoffs(" in wrote.read_text().partition("*/")[0]
 
 
-def test_an_unknown_viewer_is_a_usage_error_that_names_the_known():
-    failed = run("bridge", "babylon")
-    assert failed.exit_code == 2
-    assert "playcanvas or spark" in failed.stderr
-
-
 def test_a_folder_that_cannot_be_made_is_a_stated_error(tmp_path):
     (tmp_path / "taken").write_text("")
     asked = ("bridge", "spark", "--out", tmp_path / "taken" / "website")

@@ -211,13 +211,6 @@ def test_the_command_learns_from_both(scene, tmp_path):
     assert record["settings"]["itself"] is False
 
 
-@pytest.mark.parametrize("value", ["model.ply", "1.5", "0.95", "0"])
-def test_a_share_is_a_number_below_one(scene, value, tmp_path):
-    _, path, _ = scene
-    asked = ("finetune", path, "--out", tmp_path / "out.ply", "--self", value)
-    fails(*asked, says="is no share of the views")
-
-
 @pytest.mark.parametrize(("line", "target"), [("true", "itself"), ("0.5", "photographs")])
 def test_a_file_of_options_says_it_with_or_without_a_share(scene, line, target, tmp_path):
     data, path, _ = scene

@@ -53,23 +53,6 @@ def test_values_out_of_range_are_usage(options):
 
 
 @pytest.mark.parametrize(
-    ("options", "instead"),
-    [
-        (("--target-time", 1.5), "--target-speedup"),
-        (("--from-iter", 5), "--stage finetune or joint"),
-        (("--from-iter", 5, "--stage", "off"), "--stage finetune or joint"),
-    ],
-)
-def test_run_refuses_what_it_cannot_do_honestly_and_says_what_to_use(options, instead):
-    fails("run", *options, *HOST, says=(options[0], instead))
-
-
-def test_a_bound_of_loss_needs_photographs():
-    asked = ("finetune", __file__, "--self", "--out", "out.ply", "--max-drop", 0.1)
-    fails(*asked, says="--self with --max-drop")
-
-
-@pytest.mark.parametrize(
     ("options", "iterations", "warmup"),
     [
         *(((), 5000, 3000), (("--views", 4), 1250, 750), (("--self",), 1000, 0)),

@@ -135,11 +135,6 @@ def test_a_missing_library_is_a_usage_error_that_says_what_to_install(tmp_path, 
     assert not out.exists()
 
 
-@pytest.mark.parametrize("word", ["csv", "csv:", "paper:x", ":x", "bar:3"])
-def test_a_log_of_no_kind_is_a_usage_error(tmp_path, word):
-    assert run("finetune", __file__, "--out", tmp_path / "b.ply", "--log", word).exit_code == 2
-
-
 def test_a_log_that_fails_later_does_not_stop_learning(tmp_path, caplog):
     data, model, _ = tiny.scene(tmp_path)
     with caplog.at_level(logging.WARNING):
@@ -161,10 +156,6 @@ def test_a_config_file_gives_the_options(tmp_path):
     assert report["settings"]["train"] == "opacity"
     other = run_json(*words, "--out", tmp_path / "b.ply", "--iters", 2)  # the line goes before
     assert other["iterations"] == 2
-
-
-def test_a_config_file_that_is_missing_is_a_usage_error(tmp_path):
-    fails("run", "--config", tmp_path / "a.toml", "--", "python", "train.py", says="no such file")
 
 
 def test_a_shell_completes_commands():

@@ -8,15 +8,6 @@ from PIL import Image
 from fragprune_plugins.workbench.commands import cli
 
 
-def test_a_misspelt_option_of_run_is_not_the_hosts_command():
-    fails("run", "--quik", "--", "python", "train.py", says="Did you mean '--quick'?")
-
-
-@pytest.mark.parametrize(("word", "meant"), [("dem", "demo"), ("finetun", "finetune")])
-def test_a_misspelt_command_is_guessed(word, meant):
-    fails(word, says=f"Did you mean {meant}?")
-
-
 @pytest.mark.parametrize(
     "name",
     [

@@ -127,11 +127,3 @@ def test_serves_until_ctrl_c(cut_scene, monkeypatch):
     assert b"<title>" in opened[1]
     report = run_json("view", cut_scene[1], "--no-browser")
     assert len(opened) == 3
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [(("--data", "x", "--cameras", "y"), "--cameras"), (("--port", "70000"), "--port")],
-)
-def test_options_that_do_not_fit(cut_scene, options, words):
-    fails("view", cut_scene[1], *options, says=words)

@@ -8,7 +8,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
-from cli.commands import fails, run, run_json
+from cli.commands import fails, run_json
 from finetune import tiny
 
 from fragprune_plugins.files.ply import write_ply
@@ -117,9 +117,3 @@ def test_without_the_library_the_message_says_what_to_install(tmp_path, monkeypa
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     fails("render", model, "--orbit", "--out", tmp_path / "a.mp4", says="fragprune-plugins[video]")
     assert not (tmp_path / "a.mp4").exists()
-
-
-@pytest.mark.parametrize("up", ["1,2", "a,b,c", "0,0,0", "nan,0,1", "inf,0,0"])
-def test_a_direction_that_is_none_is_a_usage_error(tmp_path, up):
-    words = ("render", "a.ply", "--orbit", "--up", up, "--out", tmp_path / "a.mp4")
-    assert run(*words).exit_code == 2
