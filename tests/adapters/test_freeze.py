@@ -39,19 +39,6 @@ def test_before_stage_two_the_host_has_its_way():
         assert len(model.get_xyz) == rows
 
 
-def test_the_rates_of_stage_two_are_the_schedules():
-    settings = Settings(iterations=5, train="appearance", opacity_lr=0.02)
-    with running(settings) as host:
-        model, camera = host.model(20), host.camera()
-        rates, own = [], rates_of(model)
-        model.optimizer.register_step_pre_hook(lambda *_: rates.append(rates_of(model)))
-        for iteration in range(1, 6):
-            host.step(model, camera, iteration)
-            assert rates_of(model) | {"xyz": 0} == own | {"xyz": 0}  # what the host pickles
-    assert [r["opacity"] for r in rates] == pytest.approx([0.02 * 0.1 ** (i / 4) for i in range(5)])
-    assert [r["f_dc"] for r in rates] == pytest.approx([0.0025 * 0.1 ** (i / 4) for i in range(5)])
-
-
 def test_on_a_cpu_adam_is_fused_in_stage_two_and_the_host_pickles_its_own():
     with running(Settings(iterations=5, train="appearance"), from_step=2) as host:
         model, camera = host.model(20), host.camera()

@@ -1,4 +1,4 @@
-"""``--stage finetune`` starts from the last file of the host's own training, and names it."""
+"""Where stage 2 starts: the last file of the host's own training; what starts from stage 2."""
 
 import logging
 import shutil
@@ -150,6 +150,57 @@ def test_a_folder_with_nothing_of_stage_one_says_how_to_go_on(photographs, out):
     with pytest.raises(UsageError, match="only results of stage 2") as caught:
         run(command(photographs, out, 10), FINETUNE)
     assert "--start_checkpoint" in caught.value.remedy
+
+
+NAMES = ("xyz", "f_dc", "f_rest", "scaling", "rotation", "opacity")
+
+
+def parameters(checkpoint):
+    capture, _ = torch.load(checkpoint, weights_only=False)
+    return dict(zip(NAMES, capture[1:7], strict=True))
+
+
+def rates(checkpoint):
+    groups = torch.load(checkpoint, weights_only=False)[0][10]["param_groups"]
+    return {group["name"]: group["lr"] for group in groups if group["name"] != "xyz"}
+
+
+def moved(before, after):
+    one, other = parameters(before), parameters(after)
+    return {name for name in NAMES if not torch.equal(one[name], other[name])}
+
+
+@pytest.fixture(scope="module")
+def trained(photographs, tmp_path_factory):
+    """Twelve iterations and six of stage 2; checkpoints of iterations 12 and 16."""
+    out = tmp_path_factory.mktemp("trained")
+    run(command(photographs, out, 12, "--checkpoint_iterations", 16), OPTIONS)
+    assert moved(out / "chkpnt12.pth", out / "chkpnt16.pth") == {"opacity"}
+    return out
+
+
+@pytest.mark.parametrize("stage", ["off", "joint", "finetune"])
+def test_from_a_checkpoint_of_stage_two_everything_trains_again(
+    photographs, trained, tmp_path, stage
+):
+    start, out = trained / "chkpnt16.pth", tmp_path / "out"
+    more = ["--start_checkpoint", start, "--checkpoint_iterations", 21]
+    settings = replace(SETTINGS, train="all")
+    words = command(photographs, out, 22, *more)
+    run(words, replace(OPTIONS, stage=stage, settings=settings))
+    # a second band comes much later
+    assert moved(start, out / "chkpnt21.pth") == set(NAMES) - {"f_rest"}
+
+
+def test_a_stage_two_that_began_from_a_ply_writes_checkpoints_of_the_host(
+    photographs, trained, tmp_path
+):
+    (tmp_path / ply(12)).parent.mkdir(parents=True)
+    shutil.copy(trained / ply(12), tmp_path / ply(12))
+    words = command(photographs, tmp_path, 12, "--checkpoint_iterations", 16)
+    run(words, FINETUNE)
+    assert all(p.requires_grad for p in parameters(tmp_path / "chkpnt16.pth").values())
+    assert rates(tmp_path / "chkpnt16.pth") == rates(trained / "chkpnt12.pth")
 
 
 @pytest.mark.parametrize("content", [b"", b"cut off", "a list"], ids=["empty", "bytes", "a list"])
