@@ -53,10 +53,6 @@ def test_on_a_cpu_adam_is_fused_in_stage_two_and_the_host_pickles_its_own():
     assert fused == [set(), set(), appearance, appearance]
 
 
-def rates_of(model):
-    return {group["name"]: group["lr"] for group in model.optimizer.param_groups}
-
-
 def test_thresholds_step_once_a_counted_step_however_often_the_hosts_optimizer_does():
     """A subclass whose step() calls its parent's fires the hook twice."""
     with running(Settings(iterations=9, train="opacity")) as host:
