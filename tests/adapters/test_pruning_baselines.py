@@ -9,7 +9,7 @@ import torch
 from miniatures import runs
 from miniatures.compact_3dgs import CompactHost
 from miniatures.lp_3dgs import LPHost
-from miniatures.runs import check_stage_two, edit, written
+from miniatures.runs import check_stage_two, edit, miniature, written
 from miniatures.speedy_splat import SpeedyHost
 from miniatures.vanilla_3dgs import joint, running
 from plyfile import PlyData
@@ -30,14 +30,9 @@ OPTIONS = RunOptions(
 )
 
 
-@pytest.fixture(scope="module")
-def speedy(tmp_path_factory):
-    return written(SpeedyHost, tmp_path_factory.mktemp("speedy"))
-
-
-@pytest.fixture(scope="module")
-def lp(tmp_path_factory):
-    return written(LPHost, tmp_path_factory.mktemp("lp"))
+speedy, _ = miniature(SpeedyHost, SpeedySplat)
+lp, _ = miniature(LPHost, LP3DGS)
+compact, _ = miniature(CompactHost, Compact3DGS)
 
 
 def command(root, *more):
@@ -133,11 +128,6 @@ def test_the_model_with_a_mask_is_refused_before_stage_one(lp, photographs, tmp_
 
 
 # -- Compact-3DGS --------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def compact(tmp_path_factory):
-    return written(CompactHost, tmp_path_factory.mktemp("compact"))
 
 
 def test_compact_is_known_by_its_codebooks_and_hash_grid(tmp_path):

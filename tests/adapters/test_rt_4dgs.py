@@ -6,6 +6,7 @@ from importlib import import_module
 import pytest
 import torch
 from miniatures.rt_4dgs import PythonHost, RigidHost, RT4DGSHost
+from miniatures.runs import miniature
 from scenes import blended
 
 from fragprune_plugins.engines.reference import ReferenceEngine
@@ -25,16 +26,11 @@ ENGINE = ReferenceEngine()
 HOSTS = {"4D rotation": RT4DGSHost, "without": RigidHost, "in Python": PythonHost}
 
 
-@pytest.fixture(scope="module")
-def mini(tmp_path_factory):
-    root = tmp_path_factory.mktemp("rt")
-    RT4DGSHost().write(root)
-    return root
+mini, options_of = miniature(RT4DGSHost, RT4DGS)
 
 
 def of(mini, driver=None, **options):
-    defaults = {"path": mini, "adapter": RT4DGS(), "driver": driver or RT4DGSHost()}
-    return defaults | {"engine": "reference"} | options
+    return options_of(mini, driver=driver or RT4DGSHost(), engine="reference", **options)
 
 
 class Notes:

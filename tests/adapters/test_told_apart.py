@@ -1,14 +1,8 @@
 """A host is known by what it does otherwise than its relatives; seams are the kit's to change."""
 
 import pytest
-from miniatures.light_gaussian import LightGaussianHost
-from miniatures.mcmc import MCMCHost
-from miniatures.mini_splatting import MiniSplattingHost
-from miniatures.mip_splatting import MipHost
-from miniatures.rain_gs import RainHost
-from miniatures.rt_4dgs import RT4DGSHost
+from miniatures.hosts import HOSTS
 from miniatures.runs import edit, written
-from miniatures.surfels import SurfelHost
 
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.stand_ins import runs_here
@@ -19,36 +13,36 @@ MODEL = "scene/gaussian_model.py"
 
 
 @pytest.mark.parametrize(
-    ("adapter", "host", "file", "old", "new", "found"),
+    ("adapter", "file", "old", "new", "found"),
     [
-        ("2dgs", SurfelHost, RENDERER, "radii, allmap = Gauss", "radii = Gauss", "gives 2 values"),
-        ("light-gaussian", LightGaussianHost, RENDERER, "f_count", "f_counts", "f_counts"),
-        ("mcmc", MCMCHost, "utils/reloc_utils.py", "compute_relocation", "another", "compute_rel"),
-        ("mip-splatting", MipHost, RENDERER, "subpixel_offset=", "offset=", "kernel_size, offset"),
-        ("mip-splatting", MipHost, MODEL, "compute_3D_filter", "compute", "no compute_3D_filter"),
-        ("mip-splatting", MipHost, MODEL, "grads_abs", "absolute", "absolute"),
-        ("mip-splatting", MipHost, RENDERER, "means2D=", "view2gaussian=0, means2D=", "view2gauss"),
-        ("rain-gs", RainHost, RENDERER, "low_pass=low_pass,\n", "", "takes what hosts share"),
-        ("rain-gs", RainHost, MODEL, "divide_ratio", "ratio", "no divide_ratio"),
-        ("rain-gs", RainHost, "scene/__init__.py", "args_dict", "options", "no args_dict"),
+        ("2dgs", RENDERER, "radii, allmap = Gauss", "radii = Gauss", "gives 2 values"),
+        ("light-gaussian", RENDERER, "f_count", "f_counts", "f_counts"),
+        ("mcmc", "utils/reloc_utils.py", "compute_relocation", "another", "compute_rel"),
+        ("mip-splatting", RENDERER, "subpixel_offset=", "offset=", "kernel_size, offset"),
+        ("mip-splatting", MODEL, "compute_3D_filter", "compute", "no compute_3D_filter"),
+        ("mip-splatting", MODEL, "grads_abs", "absolute", "absolute"),
+        ("mip-splatting", RENDERER, "means2D=", "view2gaussian=0, means2D=", "view2gauss"),
+        ("rain-gs", RENDERER, "low_pass=low_pass,\n", "", "takes what hosts share"),
+        ("rain-gs", MODEL, "divide_ratio", "ratio", "no divide_ratio"),
+        ("rain-gs", "scene/__init__.py", "args_dict", "options", "no args_dict"),
     ],
 )
-def test_a_changed_host_is_refused_by_what_changed(adapter, host, file, old, new, found, tmp_path):
-    edit(written(host, tmp_path) / file, old, new)
+def test_a_changed_host_is_refused_by_what_changed(adapter, file, old, new, found, tmp_path):
+    edit(written(HOSTS[adapter], tmp_path) / file, old, new)
     match = found_adapter(adapter).match(HostRepo(tmp_path))
     errors = [each.found for each in match.findings if each.level == "error"]
     assert any(found in error for error in errors), errors
 
 
 @pytest.mark.parametrize(
-    ("adapter", "host", "script"),
+    ("adapter", "script"),
     [
-        ("light-gaussian", LightGaussianHost, "distill_train.py"),
-        ("mini-splatting", MiniSplattingHost, "ms_d/train.py"),
+        ("light-gaussian", "distill_train.py"),
+        ("mini-splatting", "ms_d/train.py"),
     ],
 )
-def test_a_missing_script_is_named(adapter, host, script, tmp_path):
-    (written(host, tmp_path) / script).unlink()
+def test_a_missing_script_is_named(adapter, script, tmp_path):
+    (written(HOSTS[adapter], tmp_path) / script).unlink()
     match = found_adapter(adapter).match(HostRepo(tmp_path))
     assert f"no {script}" in [each.found for each in match.findings if each.level == "error"]
 
@@ -56,18 +50,18 @@ def test_a_missing_script_is_named(adapter, host, script, tmp_path):
 @pytest.mark.parametrize("compiler", [None, "/usr/local/cuda"])
 @pytest.mark.parametrize("gpu", [False, True])
 @pytest.mark.parametrize(
-    ("adapter", "host", "own", "answered"),
+    ("adapter", "own", "answered"),
     [
-        ("rain-gs", RainHost, "submodules", "simple_knn"),
-        ("rt-4dgs", RT4DGSHost, "gaussian_renderer", "pointops2_cuda"),
+        ("rain-gs", "submodules", "simple_knn"),
+        ("rt-4dgs", "gaussian_renderer", "pointops2_cuda"),
     ],
 )
 def test_a_rasterizer_of_its_own_stays_where_it_can_be_compiled(
-    adapter, host, own, answered, tmp_path, monkeypatch, compiler, gpu
+    adapter, own, answered, tmp_path, monkeypatch, compiler, gpu
 ):
     monkeypatch.setattr("torch.utils.cpp_extension.CUDA_HOME", compiler)
     monkeypatch.setattr("torch.cuda.is_available", lambda: gpu)
-    dialect = found_adapter(adapter).dialect(HostRepo(written(host, tmp_path)))
+    dialect = found_adapter(adapter).dialect(HostRepo(written(HOSTS[adapter], tmp_path)))
     assert runs_here(dialect, own) == bool(compiler and gpu)
     assert runs_here(dialect, "torch")
     assert not runs_here(dialect, answered)

@@ -115,19 +115,16 @@ COLMAP = {
 }
 
 
-@pytest.mark.parametrize("how", BLENDER)
-def test_bad_blender_scenes_are_refused_by_name(tmp_path, images, how):
-    break_it, words = BLENDER[how]
-    tiny.write_blender(tmp_path, images)
-    break_it(tmp_path)
-    with pytest.raises(DatasetError, match=words):
-        load_dataset(tmp_path)
-
-
-@pytest.mark.parametrize("how", COLMAP)
-def test_bad_colmap_scenes_are_refused_by_name(tmp_path, images, how):
-    break_it, words = COLMAP[how]
-    tiny.write_colmap(tmp_path, images)
+@pytest.mark.parametrize(
+    ("write", "break_it", "words"),
+    [
+        pytest.param(write, *how, id=name)
+        for write, wrong in ((tiny.write_blender, BLENDER), (tiny.write_colmap, COLMAP))
+        for name, how in wrong.items()
+    ],
+)
+def test_bad_scenes_are_refused_by_name(tmp_path, images, write, break_it, words):
+    write(tmp_path, images)
     break_it(tmp_path)
     with pytest.raises(DatasetError, match=words):
         load_dataset(tmp_path)

@@ -104,34 +104,31 @@ def write_photographs(folder, of: Lens, size=(WIDTH, HEIGHT)):
         photograph.save(folder / f"view{i}.png")
 
 
-COLMAP = {
-    "SIMPLE_RADIAL": "70 50 31 -0.12",
-    "RADIAL": "70 50 31 -0.12 0.01",
-    "OPENCV": "70 72 50 31 -0.1 0.02 0.004 -0.003",
-    "FULL_OPENCV": "70 72 50 31 0.1 -0.02 0.002 0.001 0.01 0.2 0.01 0.0",
-    "SIMPLE_RADIAL_FISHEYE": "70 50 31 0.03",
-    "RADIAL_FISHEYE": "70 50 31 0.03 -0.01",
-    "OPENCV_FISHEYE": "70 72 50 31 0.03 -0.01 0.002 0.0",
-}
-MEANT = {
-    "SIMPLE_RADIAL": (70, (-0.12, 0, 0, 0, 0, 0, 0, 0), False),
-    "RADIAL": (70, (-0.12, 0.01, 0, 0, 0, 0, 0, 0), False),
-    "OPENCV": (72, (-0.1, 0.02, 0.004, -0.003, 0, 0, 0, 0), False),
-    "FULL_OPENCV": (72, (0.1, -0.02, 0.002, 0.001, 0.01, 0.2, 0.01, 0), False),
-    "SIMPLE_RADIAL_FISHEYE": (70, (0.03, 0, 0, 0), True),
-    "RADIAL_FISHEYE": (70, (0.03, -0.01, 0, 0), True),
-    "OPENCV_FISHEYE": (72, (0.03, -0.01, 0.002, 0), True),
-}
-
-
-@pytest.mark.parametrize("model", COLMAP)
-def test_colmaps_lens_models(tmp_path, model):
-    fy, coefficients, fisheye = MEANT[model]
+@pytest.mark.parametrize(
+    ("model", "numbers", "fy", "coefficients"),
+    [
+        ("SIMPLE_RADIAL", "70 50 31 -0.12", 70, (-0.12, 0, 0, 0, 0, 0, 0, 0)),
+        ("RADIAL", "70 50 31 -0.12 0.01", 70, (-0.12, 0.01, 0, 0, 0, 0, 0, 0)),
+        (
+            *("OPENCV", "70 72 50 31 -0.1 0.02 0.004 -0.003"),
+            *(72, (-0.1, 0.02, 0.004, -0.003, 0, 0, 0, 0)),
+        ),
+        (
+            *("FULL_OPENCV", "70 72 50 31 0.1 -0.02 0.002 0.001 0.01 0.2 0.01 0.0"),
+            *(72, (0.1, -0.02, 0.002, 0.001, 0.01, 0.2, 0.01, 0)),
+        ),
+        ("SIMPLE_RADIAL_FISHEYE", "70 50 31 0.03", 70, (0.03, 0, 0, 0)),
+        ("RADIAL_FISHEYE", "70 50 31 0.03 -0.01", 70, (0.03, -0.01, 0, 0)),
+        ("OPENCV_FISHEYE", "70 72 50 31 0.03 -0.01 0.002 0.0", 72, (0.03, -0.01, 0.002, 0)),
+    ],
+)
+def test_colmaps_lens_models(tmp_path, model, numbers, fy, coefficients):
+    fisheye = "FISHEYE" in model
     of = Lens(WIDTH, HEIGHT, 70, fy, 50, 31, coefficients, fisheye)
     write_photographs(tmp_path / "images", of)
     sparse = tmp_path / "sparse" / "0"
     sparse.mkdir(parents=True)
-    (sparse / "cameras.txt").write_text(f"1 {model} {WIDTH} {HEIGHT} {COLMAP[model]}\n")
+    (sparse / "cameras.txt").write_text(f"1 {model} {WIDTH} {HEIGHT} {numbers}\n")
     rows = [f"{i + 1} 1 0 0 0 {i / 10} 0 0 1 view{i}.png\n\n" for i in range(9)]
     (sparse / "images.txt").write_text("".join(rows))
     shot = load_dataset(tmp_path).train[0]

@@ -22,6 +22,7 @@ from fragprune_plugins.learning.schedule import Settings
 SCRIPT = Path(__file__).parents[1] / "miniatures" / "simple_trainer.py"
 RELEASES = releases()
 TOTAL, MORE = 24, 6
+adapter, repo = SimpleTrainer(SCRIPT), HostRepo.installed("gsplat")
 
 
 @pytest.fixture(params=RELEASES.values(), ids=RELEASES.keys())
@@ -119,7 +120,6 @@ def test_joint_learning_begins_where_refinement_ends(train, tmp_path):
     ],
 )
 def test_flags_that_stage_two_cannot_follow_are_refused(words, named):
-    adapter, repo = SimpleTrainer(SCRIPT), HostRepo.installed("gsplat")
     how = {"stage": "auto", "device": "cpu"}
     adapter.refuse(repo, ["default", "--camera-model", "pinhole", "--steps_scaler=1"], **how)
     with pytest.raises(UsageError, match=named):
@@ -129,7 +129,6 @@ def test_flags_that_stage_two_cannot_follow_are_refused(words, named):
 @pytest.mark.parametrize("device", ["cuda", "cuda:1", "cpu"])
 @pytest.mark.parametrize("stage", ["auto", "finetune", "joint"])
 def test_absolute_gradients_are_for_strategies_that_run_on_a_gpu_before_stage_two(stage, device):
-    adapter, repo = SimpleTrainer(SCRIPT), HostRepo.installed("gsplat")
     fine = device != "cpu" and stage != "joint"
     with contextlib.nullcontext() if fine else pytest.raises(UsageError, match="absgrad"):
         adapter.refuse(repo, ["default", "--strategy.absgrad"], stage=stage, device=device)
@@ -142,7 +141,6 @@ def test_they_are_refused_before_the_training(train, tmp_path):
 
 
 def test_what_the_script_reads_is_known_where_it_leaves_the_world_as_it_is():
-    adapter, repo = SimpleTrainer(SCRIPT), HostRepo.installed("gsplat")
     words = ["default", "--data-dir", "in", "--save_ply"]
     with pytest.raises(NotComparedError, match="turns and scales"):
         adapter.photographs(repo, words)
@@ -164,7 +162,6 @@ def test_what_the_script_reads_is_known_where_it_leaves_the_world_as_it_is():
     ],
 )
 def test_its_models_are_measured_as_the_script_draws_them(words, factor):
-    adapter, repo = SimpleTrainer(SCRIPT), HostRepo.installed("gsplat")
     drawn = adapter.drawing(repo, ["default", *words])
     assert (drawn["near"], drawn.get("compensation")) == (0.01, factor)
     assert drawn["alpha_max"] == adapter.dialect(repo).alpha_max != 0.99  # of 1.4 and 1.5

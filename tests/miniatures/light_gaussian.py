@@ -21,6 +21,7 @@ from miniatures.family import (
     adding,
     parsing,
 )
+from miniatures.speedy_splat import prune_by_score
 
 args = SimpleNamespace()  # the host's scripts hold their options under this name
 
@@ -256,10 +257,6 @@ class LightGaussianHost(Descendant):
             "prune by opacity": lambda m, arguments, chance: m.prune_opacity(chance.share),
             "densify": densify_alone,
         }
-
-
-def prune_by_score(model, arguments, chance: Chance):
-    model.prune_gaussians(chance.share, chance.uniform(len(model.get_xyz)))
 
 
 def densify_alone(model, arguments, chance: Chance):
