@@ -1,9 +1,7 @@
 """Whole runs of the demo's host through the launcher: neutral, interrupted, resumed, rendered."""
 
-import contextlib
 import gc
 import json
-import os
 import random
 import shutil
 import signal
@@ -17,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from cli.commands import run as command_line
+from finetune.several import ended
 from miniatures import runs
 from miniatures.runs import OPTIONS, check_stage_two
 from miniatures.vanilla_3dgs import HOST, InterruptAt, run_script, running
@@ -145,13 +144,12 @@ def test_killed_while_saving_it_starts_again_from_stage_one_and_leaves_nothing(
     """The host has written its model, the sidecar is not there yet."""
     finetune = replace(OPTIONS, stage="finetune")
     killed = Path(shutil.copytree(trained, tmp_path / "killed"))
-    pid = os.fork()
-    if pid == 0:
+
+    def die():
         monkeypatch.setattr(sidecar, "put", lambda *_: signal.raise_signal(signal.SIGKILL))
-        with contextlib.suppress(BaseException):
-            run(command(photographs, killed, 10), finetune)
-        os._exit(0)
-    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == -signal.SIGKILL
+        run(command(photographs, killed, 10), finetune)
+
+    assert ended(die) == -signal.SIGKILL
     models = [run(command(photographs, out, 10), finetune).model_after for out in (trained, killed)]
     assert models[0].read_bytes() == models[1].read_bytes()
     one, other = (sidecar.load(model)[0] for model in models)
@@ -168,12 +166,7 @@ def test_sigterm_in_stage_one_ends_the_process_as_the_host_alone(photographs, tm
     runs.edit(script, loop, loop + kill)
     words = ["run", "--device", "cpu", "--", str(script)]
     words += command(photographs, tmp_path / "out", 10)[1:]
-    pid = os.fork()
-    if pid == 0:
-        with contextlib.suppress(BaseException):
-            command_line(*words)
-        os._exit(0)
-    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == -signal.SIGTERM
+    assert ended(lambda: command_line(*words)) == -signal.SIGTERM
 
 
 def test_train_then_finetune_then_render(photographs, tmp_path):

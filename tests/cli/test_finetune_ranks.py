@@ -13,28 +13,15 @@ import pytest
 import torch
 from cli.commands import fails, run_json
 from cli.commands import finetune_words as words
-from finetune.several import command
+from finetune.several import at_step, command
 
 from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.files.ply import read_ply
-from fragprune_plugins.workbench.finetune import loop
 from fragprune_plugins.workbench.scenes.dataset import Photograph
 
 
 def names(folder):
     return {each.name for each in folder.iterdir()}
-
-
-def at_step(number, do):
-    """Do something when this process is in the midst of a step."""
-    begin = loop.Stage2.begin
-
-    def beginning(stage, opacities):
-        if stage.steps == number:
-            do()
-        return begin(stage, opacities)
-
-    loop.Stage2.begin = beginning
 
 
 def test_the_first_process_writes_and_reports_and_the_others_say_nothing(scene, tmp_path):

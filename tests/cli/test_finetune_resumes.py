@@ -1,6 +1,5 @@
 """The same ``fragprune finetune`` again, after a kill or after its end."""
 
-import contextlib
 import json
 import os
 import signal
@@ -9,27 +8,21 @@ import pytest
 from cli.commands import fails, run, run_json
 from cli.commands import finetune_words as words
 from finetune import tiny
+from finetune.several import at_step, ended
 
 from fragprune_plugins.files.atomic import locked
-from fragprune_plugins.workbench.finetune import loop, resuming
+from fragprune_plugins.workbench.finetune import resuming
 
 
 def killed(step, *arguments):
     """Run the command in a process of its own, and kill it with -9 in the midst of a step."""
-    pid = os.fork()
-    if pid == 0:
-        begin = loop.Stage2.begin
 
-        def dying(stage, opacities):
-            if stage.steps == step:
-                os.kill(os.getpid(), signal.SIGKILL)
-            return begin(stage, opacities)
+    def die():
+        resuming.EVERY = 0.001
+        at_step(step, lambda: signal.raise_signal(signal.SIGKILL))
+        run(*arguments)
 
-        loop.Stage2.begin, resuming.EVERY = dying, 0.001
-        with contextlib.suppress(BaseException):
-            run(*arguments)
-        os._exit(0)
-    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == -signal.SIGKILL
+    assert ended(die) == -signal.SIGKILL
 
 
 def test_killed_twice_the_same_command_ends_with_the_same_files(scene, tmp_path):

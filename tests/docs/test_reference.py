@@ -1,10 +1,11 @@
-"""Pages link to pages that exist, and what is read off the code names everything it is to name."""
+"""Pages link to pages that exist; what is read off the code names all; adapters say what is what."""
 
 import re
 from pathlib import Path
 from runpy import run_path
 
 import pytest
+from cli.commands import run_json
 
 import fragprune_plugins
 from fragprune_plugins import errors
@@ -14,6 +15,7 @@ from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.workbench.commands import cli
 
 DOCS = Path(__file__).parents[2] / "docs"
+ADAPTERS = load_plugins().adapters
 MADE = run_path(str(DOCS / "generate.py"))["PAGES"]
 
 
@@ -26,7 +28,7 @@ MADE = run_path(str(DOCS / "generate.py"))["PAGES"]
         ("command-line.md", [f"fragprune {name}" for name in cli.list_commands(None)]),
         ("errors.md", [kind.__name__ for kind in errors.FragpruneError.__subclasses__()]),
         ("adapters.md", ["HostAdapter"]),
-        ("support.md", [adapter.name for adapter in load_plugins().adapters]),
+        ("support.md", [adapter.name for adapter in ADAPTERS]),
     ],
 )
 def test_a_page_made_from_the_code_names_all_of_it(name, listed):
@@ -53,3 +55,19 @@ def test_every_page_is_in_the_index():
     pages = {str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md")} - {"index.md"}
     pages |= {f"reference/{name}" for name in MADE}
     assert not [page for page in sorted(pages) if f"({page})" not in index]
+
+
+@pytest.mark.parametrize("adapter", ADAPTERS, ids=lambda adapter: adapter.name)
+def test_every_adapter_says_what_it_is_for(adapter):
+    assert adapter.info.title
+    assert adapter.info.repo.count("/") == 1
+    assert adapter.info.states
+    for limit in adapter.info.limits:
+        assert limit.endswith(".")
+        assert "\n" not in limit
+
+
+def test_scripts_and_limits_are_data_too():
+    (vanilla,) = (a for a in run_json("adapters")["adapters"] if a["name"] == "vanilla-3dgs")
+    assert vanilla["scripts"] == ["train.py"]
+    assert vanilla["limits"]

@@ -3,6 +3,7 @@
 A child of its own keeps the store, as torchrun's agent does, so that it outlives any of them.
 """
 
+import contextlib
 import math
 import os
 import signal
@@ -41,11 +42,11 @@ class Ended:
     left: Any
 
 
-def _forked(work: Callable[[], None]) -> int:
+def _forked(work: Callable[[], None], seconds: int = LONGEST) -> int:
     pid = os.fork()
     if pid == 0:
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
-        signal.alarm(LONGEST)
+        signal.alarm(seconds)
         torch.set_num_threads(1)
         try:
             work()
@@ -54,6 +55,16 @@ def _forked(work: Callable[[], None]) -> int:
             os._exit(99)
         os._exit(0)
     return pid
+
+
+def ended(work: Callable[[], Any]) -> int:
+    """The exit code of a process in which a function was called: minus a signal's number."""
+
+    def quietly() -> None:
+        with contextlib.suppress(BaseException):
+            work()
+
+    return os.waitstatus_to_exitcode(os.waitpid(_forked(quietly, seconds=0), 0)[1])
 
 
 def _keep_store(pipe: int) -> None:
@@ -119,6 +130,18 @@ def learn(size: int, work: Callable[[Any], Any]) -> list[Any]:
     ended = launch(size, one)
     assert [each.code for each in ended] == [0] * size
     return [each.left for each in ended]
+
+
+def at_step(number: int, do: Callable[[], object]) -> None:
+    """Do something when this process is in the midst of a step."""
+    begin = loop.Stage2.begin
+
+    def beginning(stage: Any, opacities: Any) -> Any:
+        if stage.steps == number:
+            do()
+        return begin(stage, opacities)
+
+    loop.Stage2.begin = beginning  # type: ignore[method-assign]
 
 
 def lose_nan(ranks: Any) -> None:
