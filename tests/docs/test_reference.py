@@ -1,4 +1,4 @@
-"""Pages link to pages that exist; what is read off the code names all; adapters say what is what."""
+"""Pages link to pages that exist; what is read off the code names all; adapters say what they do."""
 
 import re
 from pathlib import Path
