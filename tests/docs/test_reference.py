@@ -1,4 +1,4 @@
-"""Pages link to pages that exist; what is read off the code names all; adapters say what they do."""
+"""Pages link to pages that exist; what is read off the code names it all; so do adapters."""
 
 import re
 from pathlib import Path
