@@ -323,10 +323,3 @@ def test_a_model_that_the_host_drops_is_not_kept_alive():
         gc.collect()
         assert reference() is None
         assert host.finish().gaussians == 5
-
-
-def test_two_sessions_never_share_a_store():
-    with running() as host:
-        first = host.store(host.model(5))
-    with running() as host:
-        assert host.store(host.model(5)) is not first

@@ -24,6 +24,18 @@ def scene(tmp_path):
     return tiny.scene(tmp_path)
 
 
+@pytest.fixture
+def out(tmp_path):
+    return tmp_path / "out.ply"
+
+
+@pytest.fixture
+def words(scene, out):
+    """A fine-tuning of the scene's model, written to ``out``."""
+    data, path, _ = scene
+    return "finetune", path, "--data", data, "--out", out, "--iters"
+
+
 def test_writes_a_pair_and_a_table(scene, tmp_path):
     data, path, model = scene
     before = path.read_bytes()
@@ -49,10 +61,8 @@ def test_writes_a_pair_and_a_table(scene, tmp_path):
     assert learned.falloff is not None
 
 
-def test_json_is_one_object_with_the_house_names(scene, tmp_path):
-    data, path, _ = scene
-    out = tmp_path / "out.ply"
-    report = run_json("finetune", path, "--data", data, "--out", out, "--iters", 5, "--seed", 3)
+def test_json_is_one_object_with_the_house_names(words):
+    report = run_json(*words, 5, "--seed", 3)
     assert report["iterations"] == 5
     assert report["seed"] == 3
     assert report["adapter"] is None
@@ -65,16 +75,13 @@ def test_json_is_one_object_with_the_house_names(scene, tmp_path):
     assert report["pressure"] >= LEAST_PRESSURE
 
 
-def test_says_what_the_model_is_without_its_thresholds(scene, tmp_path):
-    data, path, _ = scene
-    out = tmp_path / "out.ply"
-    arguments = ("finetune", path, "--data", data, "--out", out, "--iters", 10)
-    report = run_json(*arguments, "--pressure", 1e-3)
-    profile = run_json("profile", out, "--data", data)
+def test_says_what_the_model_is_without_its_thresholds(scene, words, out):
+    report = run_json(*words, 10, "--pressure", 1e-3)
+    profile = run_json("profile", out, "--data", scene[0])
     for key in ("psnr", "fragments_per_pixel"):
         assert report["untruncated"][key] == profile["columns"]["untruncated"][key]
         assert report["after"][key] == profile["columns"]["truncated"][key]
-    text = run(*arguments, "--pressure", 1e-3).stdout
+    text = run(*words, 10, "--pressure", 1e-3).stdout
     plain = report["untruncated"]
     change = plain["psnr"] - report["before"]["psnr"]
     assert (
@@ -83,9 +90,9 @@ def test_says_what_the_model_is_without_its_thresholds(scene, tmp_path):
     ) in text
     assert "out.ply, which holds the cutoffs." in text
     assert not sidecar.path_beside(out).exists()
-    control = run_json(*arguments, "--control")
+    control = run_json(*words, 10, "--control")
     assert control["untruncated"] is None
-    text = run(*arguments, "--control").stdout
+    text = run(*words, 10, "--control").stdout
     assert "know no cutoffs" not in text
     assert "out.ply." in text
 
@@ -142,11 +149,9 @@ def test_drops_what_reaches_no_pixel_and_changes_no_picture(scene, tmp_path):
     assert f"Dropped {count} of 60 Gaussians, which reach no pixel of the 9 views: " in text
 
 
-def test_removes_gaussians_before_learning(scene, tmp_path):
-    data, path, model = scene
-    out = tmp_path / "kept.ply"
-    arguments = ("finetune", path, "--data", data, "--out", out, "--iters", 10)
-    report = run_json(*arguments, "--keep", 0.6, "--train", "opacity")
+def test_removes_gaussians_before_learning(scene, words, out):
+    model = scene[2]
+    report = run_json(*words, 10, "--keep", 0.6, "--train", "opacity")
     assert report["keep"] == 0.6
     assert report["before"]["gaussians"] == len(model) == 60
     assert report["after"]["gaussians"] == len(read_ply(out)) == 36
@@ -155,34 +160,30 @@ def test_removes_gaussians_before_learning(scene, tmp_path):
     assert rows == sorted(rows)
     for name in ("xyz", "f_dc", "f_rest", "scaling", "rotation"):
         assert torch.equal(getattr(left, name), getattr(model, name)[rows])
-    result = run(*arguments, "--keep", 0.6)
+    result = run(*words, 10, "--keep", 0.6)
     assert "scoring Gaussians" in result.stderr  # the bar
     assert "Removed 24 of 60 Gaussians before learning" in result.stdout
 
 
 @pytest.mark.parametrize("more", [(), ("--self", 0.5)])
-def test_what_shows_beside_the_photographs_stays(scene, tmp_path, more):
-    data, path, model = scene
-    out = tmp_path / "kept.ply"
-    arguments = ("finetune", path, "--data", data, "--out", out, "--iters", 3, *more)
+def test_what_shows_beside_the_photographs_stays(scene, words, out, more):
+    data, _, model = scene
     shots = fp.load_dataset(data).train
     views = fp.views_near(shots)
     for keep, expected in (
         (0.7, fp.keep_best(model, 0.7, views)),
         ("auto", fp.keep_needed(model, shots, views)),
     ):
-        report = run_json(*arguments, "--keep", keep, "--train", "opacity")
+        report = run_json(*words, 3, *more, "--keep", keep, "--train", "opacity")
         assert report["keep"] == keep
         assert torch.equal(read_ply(out).xyz, expected.xyz)
     alone = fp.keep_best(model, 0.7, [shot.view for shot in shots])
     assert not torch.equal(alone.xyz, fp.keep_best(model, 0.7, views).xyz)
 
 
-def test_what_a_model_itself_can_spare_is_not_known(scene, tmp_path):
-    data, path, _ = scene
-    arguments = ("finetune", path, "--data", data, "--out", tmp_path / "out.ply", "--self")
-    fails(*arguments, "--keep", "auto", says="--keep auto")
-    report = run_json(*arguments, "--keep", 0.9, "--iters", 3)
+def test_what_a_model_itself_can_spare_is_not_known(words):
+    fails(*words, 3, "--self", "--keep", "auto", says="--keep auto")
+    report = run_json(*words, 3, "--self", "--keep", 0.9)
     assert report["after"]["gaussians"] == 54
 
 
@@ -229,21 +230,17 @@ def test_a_control_truncates_nothing_and_is_quoted_by_the_same_training(scene, t
     assert run_json(*arguments, "--out", tmp_path / "pruned.ply")["control"] == report["after"]
 
 
-def test_a_target_time_says_what_was_reached(scene, tmp_path, monkeypatch):
+def test_a_target_time_says_what_was_reached(words, monkeypatch):
     tiny.exact_clock(monkeypatch)
-    data, path, _ = scene
-    arguments = ("finetune", path, "--data", data, "--out", tmp_path / "out.ply", "--iters", 20)
-    report = run_json(*arguments, "--target-time", 1.2)
+    report = run_json(*words, 20, "--target-time", 1.2)
     assert report["target_reached"]
     assert report["faster"] == pytest.approx(1.2, rel=0.02)
     assert report["settings"]["goal"] == "faster=1.2"
 
 
-def test_a_bound_on_the_loss_trains_the_control_and_names_the_views(scene, tmp_path):
-    data, path, _ = scene
-    out = tmp_path / "out.ply"
-    words = ("--data", data, "--out", out, "--iters", 6, "--train", "opacity", "--max-drop", 5)
-    report = run_json("finetune", path, *words)
+def test_a_bound_on_the_loss_trains_the_control_and_names_the_views(words, out):
+    asked = (*words, 6, "--train", "opacity", "--max-drop", 5)
+    report = run_json(*asked)
     found = report["max_drop"]
     assert found["bound"] == 5
     assert found["met"]
@@ -254,21 +251,20 @@ def test_a_bound_on_the_loss_trains_the_control_and_names_the_views(scene, tmp_p
     goal = parse_goal(report["settings"]["goal"])
     assert goal.weight in (None, pytest.approx(found["pressure"]))
     assert read_ply(out).falloff is not None
-    text = run("finetune", path, *words).stdout
+    text = run(*asked).stdout
     assert "Loss against the control" in text
     assert "chosen on these 2 views" in text
 
 
-def test_sigterm_saves_at_once_and_leaves_with_143(scene, tmp_path, monkeypatch):
-    data, path, _ = scene
-    out, before = tmp_path / "out.ply", signal.getsignal(signal.SIGTERM)
+def test_sigterm_saves_at_once_and_leaves_with_143(words, out, monkeypatch):
+    before = signal.getsignal(signal.SIGTERM)
 
     def measured(*args, **kwargs):
         raise AssertionError("whoever sends SIGTERM does not wait for this")
 
     tiny.at_loss(monkeypatch, 4, lambda: signal.raise_signal(signal.SIGTERM))
     monkeypatch.setattr("fragprune_plugins.workbench.figures.evaluate.measure_all", measured)
-    result = run("finetune", path, "--data", data, "--out", out, "--iters", 50, "--json")
+    result = run(*words, 50, "--json")
     assert result.exit_code == 143
     report = json.loads(result.stdout)
     # The step under way is finished first.
@@ -277,10 +273,9 @@ def test_sigterm_saves_at_once_and_leaves_with_143(scene, tmp_path, monkeypatch)
     assert signal.getsignal(signal.SIGTERM) is before
 
 
-def test_divergence_is_a_stated_failure_and_writes_nothing(scene, tmp_path, monkeypatch):
-    data, path, _ = scene
+def test_divergence_is_a_stated_failure_and_writes_nothing(words, tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "photometric_loss", lambda image, _: image.mean() * math.nan)
-    result = run("finetune", path, "--data", data, "--out", tmp_path / "out.ply", "--json")
+    result = run(*words, 5, "--json")
     assert result.exit_code == 1
     error = json.loads(result.stdout)["error"]
     assert error["code"] == "not-finite"
