@@ -1,11 +1,10 @@
 """NaN and infinity end stage 2 with a stated error, and nothing of them is saved."""
 
-import json
 from pathlib import Path
 
 import pytest
 import torch
-from cli.commands import run as command_line
+from cli.commands import run_error
 from miniatures.runs import TINY
 from miniatures.vanilla_3dgs import HOST, joint, running
 
@@ -110,9 +109,7 @@ def test_a_run_that_diverges_ends_with_exit_code_1_and_saves_nothing(photographs
     plug(SpoilAt(4))
     out = tmp_path / "out"
     words = [HOST / "train.py", "-s", photographs, "-m", out, "--iterations", 10, *TINY]
-    result = command_line("run", "--device", "cpu", "--iters", 8, "--json", "--", *words)
-    assert result.exit_code == 1
-    error = json.loads(result.stdout)["error"]
+    error = run_error("run", "--device", "cpu", "--iters", 8, "--json", "--", *words)
     assert error["code"] == "not-finite"
     assert "opacity (7 of " in error["found"]
     assert [p.name for p in sorted(Path(out).glob("point_cloud/*"))] == ["iteration_10"]

@@ -10,7 +10,7 @@ import torch
 from miniatures import runs
 from miniatures.rain_gs import RainHost
 from miniatures.runs import OPTIONS, check_stage_two, miniature
-from miniatures.vanilla_3dgs import Notes, expect_ancestors, identity, joint, label, running
+from miniatures.vanilla_3dgs import Notes, joint, running
 
 from fragprune_plugins import rasterize
 from fragprune_plugins.files import sidecar
@@ -72,23 +72,6 @@ def test_depth_is_the_blended_distance_of_what_is_drawn(mini):
     torch.testing.assert_close(
         package["depth"][drawn] / alpha[drawn], torch.full_like(alpha, z)[drawn]
     )
-
-
-# -- rows ----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("number", [2, 3])
-def test_a_far_split_appends_twice_and_every_child_has_its_parents_threshold(mini, number):
-    with joint(**of(mini)) as host:
-        model = host.model(COUNT)
-        label(host, model)
-        grads = (torch.arange(COUNT) % 3 == 0).float()[:, None]
-        model.densify_and_split(grads, 0.5, 1e-6, N=number, abe_split=True)
-        expect_ancestors(host, model)
-        split = COUNT // 3 + 1
-        # Those that were not split, then far copies, then children; the split ones are gone.
-        assert len(identity(model)) == COUNT - split + (2 * number - 1) * split
-        assert not torch.isin(identity(model)[: COUNT - split], torch.arange(0, COUNT, 3)).any()
 
 
 # -- whole runs ----------------------------------------------------------------------------------

@@ -19,6 +19,13 @@ def run_json(*arguments: object) -> dict:
     return json.loads(result.stdout)
 
 
+def run_error(*arguments: object, code: int = 1) -> dict:
+    """What a command that fails with this exit code states, as JSON on stdout."""
+    result = run(*arguments)
+    assert result.exit_code == code, result.output
+    return json.loads(result.stdout)["error"]
+
+
 def finetune_words(scene: tuple, out: object, *more: object) -> tuple:
     """A short fine-tuning of a model on its photographs."""
     data, path = scene

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from cli.commands import fails, run, run_json
+from cli.commands import fails, run, run_error, run_json
 from finetune import tiny
 
 import fragprune_plugins as fp
@@ -259,11 +259,9 @@ def test_a_bound_on_the_loss_trains_the_control_and_names_the_views(words, out):
 def test_sigterm_saves_at_once_and_leaves_with_143(words, out, monkeypatch):
     before = signal.getsignal(signal.SIGTERM)
 
-    def measured(*args, **kwargs):
-        raise AssertionError("whoever sends SIGTERM does not wait for this")
-
     tiny.at_loss(monkeypatch, 4, lambda: signal.raise_signal(signal.SIGTERM))
-    monkeypatch.setattr("fragprune_plugins.workbench.figures.evaluate.measure_all", measured)
+    measuring = "fragprune_plugins.workbench.figures.evaluate.measure_all"
+    monkeypatch.setattr(measuring, None)  # whoever sends SIGTERM does not wait for this
     result = run(*words, 50, "--json")
     assert result.exit_code == 143
     report = json.loads(result.stdout)
@@ -275,9 +273,7 @@ def test_sigterm_saves_at_once_and_leaves_with_143(words, out, monkeypatch):
 
 def test_divergence_is_a_stated_failure_and_writes_nothing(words, tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "photometric_loss", lambda image, _: image.mean() * math.nan)
-    result = run(*words, 5, "--json")
-    assert result.exit_code == 1
-    error = json.loads(result.stdout)["error"]
+    error = run_error(*words, 5, "--json")
     assert error["code"] == "not-finite"
     assert error["where"].startswith("stage 2, step 1, view view0")
     assert "opacity" in error["found"]

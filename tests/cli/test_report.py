@@ -7,7 +7,7 @@ import sys
 
 import pytest
 import torch
-from cli.commands import run, run_json
+from cli.commands import run, run_error, run_json
 from finetune import tiny
 
 from fragprune_plugins.files import records
@@ -89,7 +89,7 @@ def test_as_text_the_result_comes_first(folder):
 )
 def test_what_is_no_folder_is_refused_with_the_next_command(folder, name, found, remedy):
     out, _, _ = folder
-    error = json.loads(run("report", out / name, "--json").stdout)["error"]
+    error = run_error("report", out / name, "--json")
     assert (error["where"], error["found"]) == (str(out / name), found)
     assert remedy in error["remedy"]
     assert (f"fragprune report {out};" in error["remedy"]) == (name == "pruned.ply")
@@ -125,9 +125,8 @@ def test_without_the_photographs_there_are_curves_and_the_reason(folder, tmp_pat
     assert "No views are shown: they need files outside of" in result.stdout
     assert run_json("report", out)["pictures"] == 1
     assert len(run_json("report", out, "--data", data)["views"]) > 0
-    refused = run("report", out, "--data", tmp_path / "nowhere", "--json")
-    assert refused.exit_code == 1
-    assert json.loads(refused.stdout)["error"]["code"] == "dataset"
+    elsewhere = ("--data", tmp_path / "nowhere")
+    assert run_error("report", out, *elsewhere, "--json")["code"] == "dataset"
 
 
 def test_what_a_fine_tuning_leaves_names_no_folder_of_the_machine(finetuned, tmp_path):

@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 import torch
-from cli.commands import run, run_json
+from cli.commands import run, run_error, run_json
 from finetune import tiny
 from miniatures.runs import TINY
 from miniatures.vanilla_3dgs import HOST
@@ -168,9 +168,8 @@ def test_a_host_that_raises_leaves_one_json_object_on_stdout(tmp_path):
 def test_two_models_of_nobody_need_their_photographs_named(tmp_path):
     for name in ("a.ply", "b.ply"):
         tiny.scene(tmp_path / name[0])[1].rename(tmp_path / name)
-    result = run("compare", tmp_path / "a.ply", tmp_path / "b.ply", "--json")
-    assert result.exit_code == 2
-    assert "no record" in json.loads(result.stdout)["error"]["found"]
+    error = run_error("compare", tmp_path / "a.ply", tmp_path / "b.ply", "--json", code=2)
+    assert "no record" in error["found"]
 
 
 def test_joint_learning_is_measured_and_compared_with_another_training(scene, tmp_path):
