@@ -1,5 +1,6 @@
 """A fine-tuning that was cut off goes on, and ends with the same bits as one that was not."""
 
+import json
 import os
 import signal
 
@@ -182,9 +183,9 @@ def foreign(path):
 
 
 def not_finite(path):
-    tensors, _ = files.load(path)
+    tensors, values = files.load(path)
     tensors["exp_avg.opacity"][3] = torch.nan
-    save_file(tensors, path, metadata={"format": files.FORMAT, "values": "{}"})
+    save_file(tensors, path, metadata={"format": files.FORMAT, "values": json.dumps(values)})
 
 
 def tensors(change):
