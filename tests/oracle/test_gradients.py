@@ -16,6 +16,7 @@ from fragprune_plugins.engines.reference import (
     projected_of,
 )
 from reference_renderer import Options, render, render_footprints
+from reference_renderer.sh import sh_colors
 
 F64 = torch.float64
 # A random direction of inputs against one of outputs: entry by entry takes 30 times as long.
@@ -205,3 +206,11 @@ def test_gradients_of_an_awkward_scene_are_finite_and_zero_where_culled(dtype):
         assert leaf.grad.isfinite().all(), name
         assert not leaf.grad[culled].any(), name
         assert leaf.grad[~culled].any(), name
+
+
+def test_a_channel_clamped_at_zero_gets_no_gradient():
+    sh = torch.tensor([[[-3.0, 1.0, 0.0]]], dtype=F64, requires_grad=True)
+    colors = sh_colors(torch.tensor([[0.0, 0.6, 0.8]]).double(), torch.zeros(3).double(), sh, 0)
+    colors.sum().backward()
+    assert colors[0, 0] == 0
+    assert sh.grad[0, 0].tolist() == pytest.approx([0, 0.28209479, 0.28209479])

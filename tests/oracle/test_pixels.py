@@ -1,6 +1,5 @@
 """Images: by hand, and against loops over Python floats."""
 
-import math
 from dataclasses import replace
 
 import pytest
@@ -24,41 +23,6 @@ def test_a_splat_at_a_pixel_centre_has_its_opacity_there():
     assert pixel.tolist() == pytest.approx([0.8 * 0.9, 0.8 * 0.5 + 0.2, 0.8 * 0.1 + 0.1])
 
 
-@pytest.mark.parametrize(("dx", "dy"), [(1, 0), (0, -2), (3, 2), (-4, 1)])
-def test_alpha_falls_off_with_the_dilated_rotated_ellipse(dx, dy):
-    angle = 0.7
-    scene = scenes.one_splat(sigma=(2.0, 1.0), angle=angle, opacity=0.9, dtype=F64)
-    # The sum of a rotated diagonal matrix and 0.3 I is diagonal in the same axes.
-    along = dx * math.cos(angle) + dy * math.sin(angle)
-    across = -dx * math.sin(angle) + dy * math.cos(angle)
-    q = along**2 / 4.3 + across**2 / 1.3
-    alpha = draw(scene).alpha[0, 8 + dy, 8 + dx].item()
-    assert alpha == pytest.approx(0.9 * math.exp(-q / 2), rel=1e-6)
-
-
-def test_the_nearer_splat_is_blended_first_whatever_the_storage_order():
-    scene = scenes.two_overlapping(opacities=(0.6, 0.7), dtype=F64)
-    alone = [
-        draw(replace(scene, splats=gaussian)).alpha[0, 9, 11].item()
-        for gaussian in (row(scene.splats, 0), row(scene.splats, 1))
-    ]
-    back, front = alone
-    drawn = draw(scene)
-    expected = [front, (1 - front) * back, (1 - front) * (1 - back)]
-    assert drawn.image[:, 9, 11].tolist() == pytest.approx(expected)
-    assert drawn.alpha[0, 9, 11].item() == pytest.approx(1 - expected[2])
-    assert drawn.invdepth[0, 9, 11].item() == pytest.approx(front / 2 + (1 - front) * back / 3)
-
-
-def test_equal_depths_are_blended_in_index_order():
-    one = scenes.one_splat(opacity=0.5, color=(1.0, 0.0, 0.0), dtype=F64)
-    other = scenes.one_splat(opacity=0.5, color=(0.0, 1.0, 0.0), dtype=F64)
-    red_first = replace(one, splats=scenes.concatenate(one.splats, other.splats))
-    green_first = replace(one, splats=scenes.concatenate(other.splats, one.splats))
-    assert draw(red_first).image[:, 8, 8].tolist() == pytest.approx([0.5, 0.25, 0.0])
-    assert draw(green_first).image[:, 8, 8].tolist() == pytest.approx([0.25, 0.5, 0.0])
-
-
 CASES = {
     "plain": {},
     "sh degree 0": {"sh_degree": 0},
@@ -69,6 +33,7 @@ CASES = {
     "mip": {"compensation": "mip"},
     "offsets, features": {"offsets": True, "features": 2},
     "scaled": {"scale_modifier": 1.7},
+    "scaled, covariances": {"scale_modifier": 1.7, "cov3d": True},
     "stopped": {"stop": 0.3},
 }
 
@@ -140,12 +105,3 @@ def test_without_tiles_and_cuts_the_image_is_the_plain_sum_over_all_splats():
     drawn = render(camera_of(scene), gaussians_of(scene.splats), options=options)
     assert drawn.fragments.tolist() == [[3] * 17] * 17
     assert drawn.alpha[0, 8, 8].item() == pytest.approx(1 - 0.5 * 0.6 * 0.7)
-
-
-def row(splats, i):
-    rows = {
-        name: tensor[i : i + 1]
-        for name in ("means", "opacities", "scales", "rotations", "colors")
-        if (tensor := getattr(splats, name)) is not None
-    }
-    return replace(splats, **rows)

@@ -1,7 +1,5 @@
 """Thresholds: what they cut, what they must leave alone, and what gradient they get."""
 
-from dataclasses import replace
-
 import pytest
 import scenes
 import torch
@@ -96,28 +94,6 @@ def test_a_fragment_is_drawn_exactly_down_to_its_threshold():
     for factor, drawn in ((1 - 1e-9, 1), (1 + 1e-9, 0)):
         tau = torch.tensor([falloff * factor], dtype=F64)
         assert draw(scene, tau).fragments[8, 11] == drawn
-
-
-@pytest.mark.parametrize("pixel", [(5, 6), (17, 3), (20, 15)])
-def test_a_truncated_fragment_touches_neither_the_pixel_nor_a_gradient(pixel):
-    x, y = pixel
-    tau = torch.full((N,), 0.3, dtype=F64)
-    inputs, leaves = scenes.leaves(scene_of(3))
-    drawn = draw(inputs, tau)
-    (drawn.image[:, y, x].sum() + drawn.invdepth[0, y, x]).backward()
-    records, _ = naive.records_at(naive.splats_of(inputs, tau), x, y)
-    cut = [r.row for r in records if not r.drawn]
-    kept = torch.tensor(sorted(r.row for r in records if r.drawn))
-    assert len(cut) > 0
-    for name in set(leaves) - {"background"}:
-        assert not leaves[name].grad[cut].any(), name
-    rows = {
-        name: getattr(inputs.splats, name)[kept]
-        for name in ("means", "opacities", "scales", "rotations", "sh")
-    }
-    only = replace(inputs, means2d_hook=None, splats=replace(inputs.splats, **rows))
-    alone = draw(only, tau[kept])
-    assert torch.allclose(alone.image[:, y, x], drawn.image[:, y, x], rtol=0, atol=1e-14)
 
 
 def explicit_gradients(inputs, tau, pressure):
