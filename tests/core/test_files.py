@@ -17,7 +17,6 @@ from fragprune_plugins.files.atomic import (
     locked,
     put,
     replacing,
-    staging,
     writable_folder,
 )
 
@@ -149,17 +148,6 @@ def test_where_there_are_no_locks_writing_goes_on_without(tmp_path, monkeypatch,
         new.write_text("whole")
     assert left.exists()  # of whom, nobody can tell
     assert sorted(tmp_path.iterdir()) == [left, tmp_path / "a.txt"]
-
-
-def test_a_folder_that_a_dead_process_left_is_removed_by_the_next(tmp_path):
-    left = in_flight(tmp_path / "a.txt", "new-left")
-    left.mkdir()
-    (left / "half").write_text("x")
-    with staging(tmp_path / "a.txt") as folder:
-        assert folder.parent == tmp_path
-        assert list(folder.iterdir()) == []
-        assert not left.exists()
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_writable_folder_is_made_and_left_empty(tmp_path):

@@ -57,9 +57,14 @@ def test_a_column_of_the_file_counts_more_than_a_sidecar(tmp_path, trained):
     assert sidecar.thresholds_of(path, 6).values.tolist() == [0.25] * 6
 
 
-def test_a_sidecar_of_an_earlier_model_file_is_refused(model, trained):
+def test_a_sidecar_belongs_to_the_file_it_was_written_for_and_is_refused_for_a_later_one(
+    model, trained
+):
+    assert not sidecar.belongs(model)
     sidecar.save(model, trained)
+    assert sidecar.belongs(model)
     model.write_bytes(model.read_bytes() + b" retrained")
+    assert not sidecar.belongs(model)
     with pytest.raises(SidecarError, match="thresholds of another model"):
         sidecar.load(model)
 
@@ -164,11 +169,3 @@ def test_what_is_not_finite_is_not_written_and_the_old_sidecar_stays(model, trai
     with pytest.raises(DivergedError, match=r"thresholds \(1 of 6 rows\)"):
         sidecar.save(model, trained)
     assert path.read_bytes() == before
-
-
-def test_a_sidecar_belongs_to_the_file_it_was_written_for(model, trained):
-    assert not sidecar.belongs(model)
-    sidecar.save(model, trained)
-    assert sidecar.belongs(model)
-    model.write_bytes(model.read_bytes() + b" retrained")
-    assert not sidecar.belongs(model)

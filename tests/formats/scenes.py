@@ -4,6 +4,7 @@ import torch
 from hypothesis import strategies as st
 
 from fragprune_plugins.files.model import Model
+from reference_renderer.covariance import rotation_matrices
 
 
 def random_splat(count: int, degree: int, seed: int) -> Model:
@@ -28,15 +29,7 @@ splats = st.builds(random_splat, st.integers(1, 70), st.integers(0, 3), st.integ
 
 def shapes(splat: Model) -> torch.Tensor:
     """(N, 3, 3) covariances in units of the largest axis: what rotations are there for."""
-    w, x, y, z = torch.nn.functional.normalize(splat.rotation.double()).unbind(1)
-    turn = torch.stack(
-        [
-            *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-            *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-            *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-        ],
-        dim=1,
-    ).reshape(-1, 3, 3)
+    turn = rotation_matrices(torch.nn.functional.normalize(splat.rotation.double()))
     scales = (splat.scaling - splat.scaling.max(dim=1, keepdim=True).values).double().exp()
     half = turn * scales[:, None, :]
     return half @ half.transpose(1, 2)

@@ -99,6 +99,22 @@ def test_radius_of_a_round_splat_carries_the_hosts_floor_under_the_root():
     assert drawn.radii.tolist() == [math.ceil(3 * math.sqrt(4.3 + math.sqrt(0.1)))]
 
 
+@pytest.mark.parametrize(
+    "x", [-40.0, -17.5, -7.0, -6.99, 0.0, 8.9, 9.0, 25.0, 39.0, 41.0, 46.9, 47, 60]
+)
+def test_tile_rectangle_is_the_hosts_integer_arithmetic(x):
+    inputs = scenes.one_splat((x, 8.0), sigma=(2.0, 2.0), width=40, height=20, dtype=F64)
+    camera = camera_of(inputs)
+    prints = project.project(camera, gaussians_of(inputs.splats), Options())
+    # Exactly at x, so that the boundary cases are those meant.
+    prints = replace(prints, mean2d=torch.tensor([[x, 8.0]], dtype=F64))
+    radius = int(prints.radius.item())
+    x0 = min(3, max(0, int((x - radius) / 16)))
+    x1 = min(3, max(0, int((x + radius + 15) / 16)))
+    assert radius == 7
+    assert project.tile_rects(camera, prints).tolist() == [[x0, 0, x1, 1]]
+
+
 def columns_reached(x):
     inputs = scenes.one_splat(
         (x, 24.0), width=64, height=48, sigma=(5.0, 5.0), opacity=0.99, dtype=F64
@@ -190,9 +206,10 @@ def test_antialiasing_dims_no_further_than_to_its_floor():
 
 
 def test_mip_leaves_out_what_is_too_small():
-    for side, draws in ((0.0316, False), (0.0317, True)):  # 1e-6 is the square of 0.001
+    # 1e-6 is the square of 0.001
+    for side, dilation, draws in ((0.0316, 0.0, False), (0.0317, 0.0, True), (0.0316, 0.1, False)):
         small = scenes.one_splat(sigma=(side, side), opacity=0.9, dtype=F64)
-        inputs, leaves = scenes.leaves(replace(small, compensation="mip", dilation=0.0))
+        inputs, leaves = scenes.leaves(replace(small, compensation="mip", dilation=dilation))
         drawn = draw(inputs)
         assert (drawn.fragments.sum() > 0).item() is draws
         assert drawn.radii.item() > 0

@@ -2,12 +2,13 @@
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import pytest
 import scenes
 import torch
-from oracle.naive import color_of
+from oracle.naive import color_of, rotate
 
 from fragprune_plugins.engines.reference import ReferenceEngine, camera_of, gaussians_of, options_of
 from fragprune_plugins.errors import InputError
@@ -34,12 +35,6 @@ class Disc:
     radius: int
 
 
-def axes_of(quaternion):
-    w, x, y, z = quaternion
-    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return (np.eye(3) + 2 * w * skew + 2 * skew @ skew).T
-
-
 def lens(view):
     """World to camera, and the rays of all pixels at view depth 1."""
     matrix = view.viewmatrix.numpy()
@@ -59,7 +54,8 @@ def discs(inputs):
         mean = splats.means[row].numpy() @ matrix[:3, :3] + matrix[3, :3]
         if mean[2] <= NEAR:
             continue
-        u, v, normal = (axis @ matrix[:3, :3] for axis in axes_of(splats.rotations[row].tolist()))
+        turned = partial(rotate, splats.rotations[row].tolist())
+        u, v, normal = (turned(axis) @ matrix[:3, :3] for axis in np.eye(3))
         long, wide = inputs.scale_modifier * splats.scales[row].numpy()
         u, v = long * u, wide * v
         normal = normal if normal @ mean < 0 else -normal
