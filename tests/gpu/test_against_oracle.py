@@ -19,7 +19,7 @@ from native.test_against_oracle import (
     test_nothing_to_draw_leaves_the_background,
     test_tall_stacks_stop_where_the_oracle_does,
 )
-from native.test_dialects import dialect, flat
+from native.test_dialects import dialect, flat, test_offsets_beyond_all_bounds_are_refused
 from native.test_invariants import assert_identical, everything
 
 from fragprune_plugins.engines.cpu.engine import CpuEngine
@@ -31,6 +31,7 @@ from fragprune_plugins.errors import EngineError, InputError
 __all__ = [
     "test_changes_in_place_are_noticed",
     "test_nothing_to_draw_leaves_the_background",
+    "test_offsets_beyond_all_bounds_are_refused",
     "test_tall_stacks_stop_where_the_oracle_does",
 ]
 
@@ -156,22 +157,12 @@ def test_lists_that_do_not_fit_are_drawn_again_with_more_room(device: EmulatedDe
         assert torch.equal(expected[name], found[name]), name
 
 
-SCENE = scenes.random_scene(0)
-
-
 def test_more_entries_than_can_be_counted_are_refused(
     engine: CudaEngine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(frame, "ENTRIES_MAX", 10)
     with pytest.raises(EngineError, match="entries"):
         engine.rasterize(scenes.random_scene(0), None)
-
-
-def test_offsets_beyond_all_bounds_are_refused(engine: CudaEngine) -> None:
-    offsets = torch.zeros(28, 40, 2)
-    offsets[3, 4, 1] = torch.nan  # the bounds themselves are the cpu engine's
-    with pytest.raises(EngineError, match="sample_offsets"):
-        engine.rasterize(replace(scenes.random_scene(0), sample_offsets=offsets), None)
 
 
 def test_tensors_elsewhere_are_refused(

@@ -6,6 +6,7 @@ whose fragment counts differ by rounding are few and left out.
 
 import math
 from dataclasses import replace
+from inspect import signature
 from typing import Any, get_args
 
 import pytest
@@ -47,21 +48,8 @@ ALONE = {
 
 def dialect(seed: int, n: int = 60, width: int = 41, height: int = 29, **kind) -> RasterInputs:
     """A random scene; what is not one of its own options is set on the inputs."""
-    of_scene = {
-        "features",
-        "offsets",
-        "compensation",
-        "colors",
-        "cov3d",
-        "flat",
-        "sh_degree",
-        "stop",
-        "rim",
-    }
-    made = scenes.random_scene(
-        seed, n, width, height, **{k: v for k, v in kind.items() if k in of_scene}
-    )
-    return replace(made, **{k: v for k, v in kind.items() if k not in of_scene})
+    given = {k: kind.pop(k) for k in signature(scenes.random_scene).parameters.keys() & kind}
+    return replace(scenes.random_scene(seed, n, width, height, **given), **kind)
 
 
 def flat(inputs: RasterInputs) -> RasterInputs:

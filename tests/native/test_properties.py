@@ -15,41 +15,25 @@ from native.test_against_oracle import check_gradients, check_images, draw_pair
 
 from fragprune_plugins.constants import NEAR, TILE
 from fragprune_plugins.engines.cpu.engine import CpuEngine
-from fragprune_plugins.types import RasterInputs, Splats, View
+from fragprune_plugins.types import RasterInputs
 
 Drawn = tuple[RasterInputs, torch.Tensor | None]
 
 
-class Dice:
-    """Numbers in float64 from one seed."""
+def placed(
+    scene: RasterInputs, pixels: torch.Tensor, depths: torch.Tensor, sigma: torch.Tensor
+) -> RasterInputs:
+    """The same splats of a scene in float64, at other places and sigma pixels (N, 3) large."""
+    view = scene.view
+    scales = sigma * (depths.abs() * 2 * view.tan_fov_x / view.width)[:, None]
+    means = scenes.unproject(view, pixels, depths)
+    return replace(scene, splats=replace(scene.splats, means=means, scales=scales))
 
-    def __init__(self, seed: int) -> None:
-        self.generator = torch.Generator().manual_seed(seed)
 
-    def uniform(self, low: float, high: float, *shape: int) -> torch.Tensor:
-        return (
-            torch.rand(*shape, generator=self.generator, dtype=torch.float64) * (high - low) + low
-        )
-
-    def log_uniform(self, low: float, high: float, *shape: int) -> torch.Tensor:
-        return self.uniform(math.log(low), math.log(high), *shape).exp()
-
-    def rotations(self, n: int) -> torch.Tensor:
-        raw = torch.randn(n, 4, generator=self.generator, dtype=torch.float64)
-        return torch.nn.functional.normalize(raw, dim=1)
-
-    def splats(
-        self, view: View, pixels: torch.Tensor, depths: torch.Tensor, sigma: torch.Tensor
-    ) -> Splats:
-        """Splats of sigma pixels (N, 3) at these places."""
-        n = len(depths)
-        return Splats(
-            means=scenes.unproject(view, pixels, depths),
-            opacities=self.uniform(0.02, 1.0, n),
-            scales=sigma * (depths.abs() * 2 * view.tan_fov_x / view.width)[:, None],
-            rotations=self.rotations(n),
-            colors=self.uniform(0.0, 1.0, n, 3),
-        )
+def uniform(seed: int, low: float, high: float, *shape: int) -> torch.Tensor:
+    """Numbers in float64."""
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(*shape, generator=generator, dtype=torch.float64) * (high - low) + low
 
 
 @st.composite
@@ -58,18 +42,17 @@ def opaque_borders(draw: st.DrawFn) -> Drawn:
 
     Images end inside a tile, and some lists are longer than one batch of the engine.
     """
-    dice = Dice(draw(st.integers(0, 2**20)))
-    width, height = draw(st.sampled_from([(17, 19), (31, 33), (47, 18), (40, 50)]))
-    view = scenes.random_view(dice.generator, width, height)
-    n = draw(st.sampled_from([8, 60, 300]))
-    corners = torch.tensor([width, height]).double() / TILE
-    border = (dice.uniform(0.4, 1.0, n, 2) * corners).round() * TILE - 0.5
-    pixels = border + dice.uniform(-1.0, 1.0, n, 2)
-    sigma = dice.log_uniform(0.7, 12.0, n, 3)
-    splats = dice.splats(view, pixels, dice.uniform(1.0, 6.0, n), sigma)
-    splats = replace(splats, opacities=dice.uniform(0.5, 1.0, n))
+    seed, n = draw(st.integers(0, 2**20)), draw(st.sampled_from([8, 60, 300]))
+    size = draw(st.sampled_from([(17, 19), (31, 33), (47, 18), (40, 50)]))
+    scene = scenes.random_scene(seed, n, *size, colors=True, dtype=torch.float64)
+    corners = torch.tensor(size).double() / TILE
+    border = (uniform(seed, 0.4, 1.0, n, 2) * corners).round() * TILE - 0.5
+    pixels = border + uniform(seed + 1, -1.0, 1.0, n, 2)
+    sigma = uniform(seed + 2, math.log(0.7), math.log(12.0), n, 3).exp()
+    scene = placed(scene, pixels, uniform(seed + 3, 1.0, 6.0, n), sigma)
+    scene = replace(scene, splats=replace(scene.splats, opacities=uniform(seed + 4, 0.5, 1.0, n)))
     thresholds = scenes.random_thresholds(n, n) if draw(st.booleans()) else None
-    return scenes.cast(RasterInputs(view, splats), torch.float32), thresholds
+    return scenes.cast(scene, torch.float32), thresholds
 
 
 @settings(max_examples=25)
@@ -86,17 +69,14 @@ def test_pixels_stop_alike_on_both_sides_of_a_border(engine: CpuEngine, case: Dr
 @st.composite
 def near_the_near_plane(draw: st.DrawFn) -> Drawn:
     """Gaussians just before and just behind the near plane, on the image and far beside it."""
-    dice = Dice(draw(st.integers(0, 2**20)))
-    width, height = draw(st.sampled_from([(1, 40), (33, 1), (30, 23)]))
-    view = scenes.random_view(dice.generator, width, height)
-    n = draw(st.sampled_from([1, 2, 9]))
-    side = torch.where(dice.uniform(0.0, 1.0, n) < 0.5, -1.0, 1.0)
-    depths = NEAR + side * dice.log_uniform(1e-4, 0.1, n)
-    size = torch.tensor([view.width, view.height]).double()
-    pixels = dice.uniform(-1.5, 2.5, n, 2) * size
-    sigma = dice.log_uniform(0.1, 50.0, n, 3)
-    splats = dice.splats(view, pixels, depths, sigma)
-    return scenes.cast(RasterInputs(view, splats), torch.float32), None
+    seed, n = draw(st.integers(0, 2**20)), draw(st.sampled_from([1, 2, 9]))
+    size = draw(st.sampled_from([(1, 40), (33, 1), (30, 23)]))
+    scene = scenes.random_scene(seed, n, *size, colors=True, dtype=torch.float64)
+    side = uniform(seed, -1.0, 1.0, n).sign()
+    depths = NEAR + side * uniform(seed + 1, math.log(1e-4), math.log(0.1), n).exp()
+    pixels = uniform(seed + 2, -1.5, 2.5, n, 2) * torch.tensor(size)
+    sigma = uniform(seed + 3, math.log(0.1), math.log(50.0), n, 3).exp()
+    return scenes.cast(placed(scene, pixels, depths, sigma), torch.float32), None
 
 
 @settings(max_examples=30)
