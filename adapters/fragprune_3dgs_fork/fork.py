@@ -468,6 +468,8 @@ def _assigned(body: ast.AST, owner: str = "") -> Iterator[tuple[int, str]]:
             for each in target.elts if isinstance(target, ast.Tuple) else [target]:
                 inner: ast.AST = each
                 while isinstance(inner, ast.Subscript | ast.Attribute):
+                    if isinstance(inner, ast.Attribute) and inner.attr == "grad":
+                        break
                     if isinstance(inner, ast.Attribute) and inner.attr in PARAMETERS:
                         if not owner or ast.unparse(inner.value) == owner:
                             yield node.lineno, inner.attr  # type: ignore[attr-defined]

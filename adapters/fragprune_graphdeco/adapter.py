@@ -14,7 +14,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from fragprune_graphdeco.call import RasterizerCall, drawing_functions, read_calls
 from fragprune_graphdeco.densifying import clones, splits
 from fragprune_graphdeco.kernels import SPLAT, Kernel, read_kernels, vendored
-from fragprune_graphdeco.reading import defaults, read_flags, read_getters, training_scripts
+from fragprune_graphdeco.reading import (
+    defaults,
+    read_flags,
+    read_getters,
+    renamed,
+    training_scripts,
+)
 from fragprune_plugins.adapting import (
     CHECKPOINT_KEY,
     GROUPS,
@@ -274,7 +280,7 @@ class GraphdecoAdapter(ScriptAdapter):
             missing += [] if repo.mentions([module], [name]) else [f"no {name} in {module}"]
         packages = dict.fromkeys([self.package, *(each.package for each in self.calls)])
         return [
-            *self.other_host(repo, missing),
+            *self.other_host(repo, [*missing, *renamed(repo)]),
             *(
                 finding
                 for package in packages

@@ -116,6 +116,19 @@ def _foreign(name: str) -> bool:
     return name.startswith(".") or name in _NOT_THEIRS
 
 
+_CUDA_FILE = re.compile(r"[\"']([^\"'\s]+\.cu)[\"']")
+
+
+def _compiled(repo: HostRepo, folder: Path) -> Iterator[Path]:
+    """The CUDA sources of a project without those that its setup.py and its files do not name."""
+    sources, setup = list(_sources(folder)), repo.read(folder / "setup.py")
+    listed = _CUDA_FILE.findall(re.sub(r"#[^\n]*", "", setup))
+    named = {*listed, *(each for path in sources for each in _CUDA_FILE.findall(repo.read(path)))}
+    for path in sources:
+        if not listed or path.suffix != ".cu" or any(path.match(each) for each in named):
+            yield path
+
+
 def _sources(folder: Path) -> Iterator[Path]:
     """The CUDA sources of a project that draw; ``backward`` only differentiates."""
     for path, inside, files in os.walk(folder):
@@ -140,7 +153,7 @@ class _Project:
         self.repo, self.folder, self.package = repo, folder, package
         self.texts = {
             path: _COMMENT.sub(lambda each: "\n" * each[0].count("\n"), repo.read(path))
-            for path in _sources(folder)
+            for path in _compiled(repo, folder)
         }
 
     def compare(self, kernel: Kernel) -> Iterator[Finding]:

@@ -42,7 +42,7 @@ _OF_CALL = re.compile(
 """Parameters of a drawing function that move or select Gaussians, or are their values."""
 _SHAPES = {"repeat", "expand", "view", "reshape", "squeeze", "unsqueeze", "contiguous"}
 """Methods that change how often or in what shape a value stands, not the value."""
-_SAVES = re.compile(r"\.save_ply\(|scene\.save\(")
+_SAVES = re.compile(r"\.save_ply\(|scene\w*\.save\(")
 _UNSAVED = "none of its scripts saves a PLY"
 _FUNCTIONAL = ("torch.nn.functional", "nn.functional", "F")
 _ACTIVATIONS = {
@@ -58,12 +58,13 @@ def read_models(repo: HostRepo) -> list[Plain]:
     found = (path.parent for each in patterns for path in repo.root.glob(each) if path.is_dir())
     names = (each.relative_to(repo.root).as_posix() for each in sorted(found))
     saved = any(map(_SAVES.search, _scripts(repo).values()))  # also what is in a folder
-    models = [read_plain(repo)]
+    own, models = read_plain(repo), []
     for each in (name for name in names if "/." not in f"/{name}"):
         model = read_plain(HostRepo(repo.root / each))
         reasons = tuple(why for why in model.reasons if not saved or why != _UNSAVED)
         models.append(replace(model, folder=each, reasons=reasons))
-    return models
+    beside = not _renderers(repo) and any(each.model for each in models)
+    return [replace(own, model="") if beside else own, *models]
 
 
 _known: WeakKeyDictionary[HostRepo, Plain] = WeakKeyDictionary()
@@ -80,7 +81,7 @@ def _read_plain(repo: HostRepo) -> Plain:
     module, name = next(_models(repo), ("", ""))
     if not module:
         return Plain((*(each for each, _ in _of_drawing(repo)), _without(repo)))
-    flat = list(_flat(repo, module, name))
+    flat = list(_scales(repo, module, name))
     moving = dict(_of_drawing(repo))
     drawn = list(moving)
     made = [each for each in drawn if "3D_filter" not in each]
@@ -94,7 +95,7 @@ def _read_plain(repo: HostRepo) -> Plain:
         *_of_saving(repo, module, name),
         *_of_positions(repo, module, name),
         *getters,
-        *_of_others(repo, module),
+        *_of_others(repo, module, name),
         *_of_scripts(repo),
     ]
     moved = frozenset(each for each, moves in moving.items() if moves)
@@ -123,15 +124,20 @@ def _models(repo: HostRepo) -> Iterator[tuple[str, str]]:
         classes = [each for each in (tree.body if tree else ()) if isinstance(each, ast.ClassDef)]
         classes.sort(key=lambda each: each.name != "GaussianModel")
         for each in classes:
-            if any(getattr(node, "name", "") == "save_ply" for node in each.body):
+            saves = any(getattr(node, "name", "") == "save_ply" for node in each.body)
+            if saves and _columns(repo, f"scene.{stem}", each.name)[1]:
                 yield f"scene.{stem}", each.name
 
 
-def _of_others(repo: HostRepo, module: str) -> Iterator[str]:
-    """Other models that a training script makes, with columns that change the picture."""
-    scripts = [each.stem for each in repo.root.glob("*train*.py") if each.stem.isidentifier()]
+def _of_others(repo: HostRepo, module: str, model: str) -> Iterator[str]:
+    """Other models that training scripts make, if none makes the model alone, with columns that
+    change the picture.
+    """
+    scripts = _training(repo)
+    with_model = [each for each in scripts if repo.mentions([each], [model])]
     for other, name in _models(repo):
-        if other != module and repo.mentions(scripts, [name]):
+        alone = name != model and any(not repo.mentions([each], [name]) for each in with_model)
+        if other != module and not alone and repo.mentions(scripts, [name]):
             at = repo.place(other, f"{name}.construct_list_of_attributes")
             _, names = _columns(repo, other, name)
             own = [each for each in names if each not in _PLAIN]
@@ -170,13 +176,19 @@ def _of_columns(repo: HostRepo, module: str, name: str) -> Iterator[str]:
                 yield f"its PLY also holds {each}, {says} ({at})"
 
 
-def _flat(repo: HostRepo, module: str, name: str) -> Iterator[str]:
-    """Gaussians with two scales."""
+def _scales(repo: HostRepo, module: str, name: str) -> Iterator[str]:
+    """Gaussians with two scales, or with one."""
     setup = repo.function(module, f"{name}.create_from_pcd")
-    for node in nodes(setup):
-        if isinstance(node, ast.Call) and ast.unparse(node).endswith(".repeat(1, 2)"):
-            yield f"its Gaussians are flat, with two scales ({repo.at(module, node.lineno)})"
-            break
+    assigned = [node for node in nodes(setup) if isinstance(node, ast.Assign)]
+    stored = [each for each in assigned if ast.unparse(each.targets[0]) == "self._scaling"]
+    names = {node.id for each in stored for node in nodes(each.value) if isinstance(node, ast.Name)}
+    made = [each for each in assigned if getattr(each.targets[0], "id", "") in names]
+    for each in assigned:
+        if ast.unparse(each.value).endswith(".repeat(1, 2)"):
+            yield f"its Gaussians are flat, with two scales ({repo.at(module, each.lineno)})"
+            return
+    if made and all(ast.unparse(each.value).endswith("[..., None]") for each in made):
+        yield f"its Gaussians are round, with one scale ({repo.at(module, made[0].lineno)})"
 
 
 def _of_saving(repo: HostRepo, module: str, name: str) -> Iterator[str]:
@@ -282,7 +294,7 @@ def _of_positions(repo: HostRepo, module: str, name: str) -> Iterator[str]:
 def _of_scripts(repo: HostRepo) -> Iterator[str]:
     """A renderer that is not there, and scripts of which none saves a PLY."""
     files = _scripts(repo)
-    if repo.path("gaussian_renderer") is None:
+    if not _renderers(repo):
         found = (each for each, text in files.items() if RASTERIZER in text)
         other = next((f", but {each.relative_to(repo.root)}" for each in found), "")
         yield f"what draws its PLY was not read: there is no gaussian_renderer{other}"
@@ -290,6 +302,40 @@ def _of_scripts(repo: HostRepo) -> Iterator[str]:
         yield "what draws its PLY was not read: gaussian_renderer calls no rasterizer of 3DGS"
     if any(repo.root.glob("*.py")) and not any(map(_SAVES.search, files.values())):
         yield _UNSAVED
+    for script in _training(repo):
+        yield from _of_sums(repo, script)
+
+
+def _of_sums(repo: HostRepo, script: str) -> Iterator[str]:
+    """A picture that a training script adds up of several drawings."""
+    tree, drawn = repo.tree(script), set[str]()
+    for node in nodes(tree):
+        if isinstance(node, ast.Assign):
+            target, value = node.targets[0], node.value
+            several = isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple)
+            pairs = zip(target.elts, value.elts, strict=False) if several else [(target, value)]  # type: ignore[attr-defined]
+            for name, made in pairs:
+                picture = isinstance(made, ast.Subscript) and ast.unparse(made.slice) == "'render'"
+                drawn |= {ast.unparse(name)} if picture else set()
+    for node in nodes(tree):
+        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
+            sides = [_terms(each) & drawn for each in (node.left, node.right)]
+            if all(sides) and sides[0] != sides[1]:
+                at = repo.at(script, node.lineno)
+                yield f"its script adds several pictures, {ast.unparse(node)[:60]} ({at})"
+                return
+
+
+def _terms(node: ast.expr) -> set[str]:
+    """The names that a sum or product is made of, without those in calls."""
+    if isinstance(node, ast.BinOp):
+        return _terms(node.left) | _terms(node.right)
+    return {ast.unparse(node)}
+
+
+def _training(repo: HostRepo) -> list[str]:
+    """Modules of the scripts that train, by their names."""
+    return sorted(each.stem for each in repo.root.glob("*train*.py") if each.stem.isidentifier())
 
 
 def _scripts(repo: HostRepo) -> dict[Path, str]:
@@ -310,9 +356,10 @@ def _of_kernel(repo: HostRepo) -> Iterator[str]:
 
 def _renderers(repo: HostRepo) -> list[str]:
     """Modules of the drawing functions."""
-    files = sorted((repo.root / "gaussian_renderer").glob("*.py"))
-    others = (f"gaussian_renderer.{each.stem}" for each in files if each.stem != "__init__")
-    return ["gaussian_renderer", *others]
+    own = "gaussian_renderer"
+    files = sorted((repo.root / own).glob("*.py"), key=lambda each: each.stem != "__init__")
+    stems = [each.stem for each in files] or ["__init__"] * (repo.path(own) is not None)
+    return [own if each == "__init__" else f"{own}.{each}" for each in stems]
 
 
 def _of_drawing(repo: HostRepo) -> Iterator[tuple[str, bool]]:
@@ -320,10 +367,9 @@ def _of_drawing(repo: HostRepo) -> Iterator[tuple[str, bool]]:
 
     Those of ``render``, and of a relative by which training scripts draw in its place.
     """
-    scripts = [each.stem for each in repo.root.glob("*train*.py") if each.stem.isidentifier()]
     for module in _renderers(repo):
         functions = _drawing(repo, module)
-        named = repo.mentions(scripts, [each.name for each in functions])
+        named = repo.mentions(_training(repo), [each.name for each in functions])
         others = [each for each in functions[1:] if each.name.startswith("render")]
         instead = [each for each in others if each.name in named and "render" not in named]
         for function in [*functions[:1], *instead[:1]]:

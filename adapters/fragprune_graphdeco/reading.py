@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Collection, Iterator
 
 from fragprune_plugins.adapting import CommandLine, Finding, Function, HostRepo, imported, nodes
@@ -47,6 +48,22 @@ def read_getters(
         )
         for name, what in found
     ]
+
+
+_ELSEWHERE = re.compile(r"\w+(?:\.\w+)*\.(?:scene(?:\.\w+)*|gaussian_renderer)")
+
+
+def renamed(repo: HostRepo) -> list[str]:
+    """Modules of a checkout that its own files import under other names: others, to Python."""
+    return [
+        f"{path} imports {name}, which is no module of this folder"
+        for module in ("gaussian_renderer", "scene", "scene.gaussian_model", "train")
+        for node in getattr(repo.tree(module), "body", ())
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        for name in repo.imported_by(module, node)[:1]
+        for path in [repo.at(module, node.lineno)]
+        if _ELSEWHERE.fullmatch(name) and not repo.path(name.split(".")[0])
+    ][:1]
 
 
 def is_property(function: Function) -> bool:

@@ -469,6 +469,11 @@ def test_what_reading_cannot_follow_is_refused_by_name(tmp_path, what):
     assert expected in "; ".join(errors(repo))
 
 
+def test_gradients_that_a_script_clears_are_no_values(tmp_path):
+    cleared = f"{STATEMENT}\n            gaussians._xyz.grad[rows] = 0"
+    assert errors(fork(tmp_path, (STATEMENT, cleared))) == []
+
+
 def test_rows_and_values_stand_still_by_what_methods_do_not_by_their_names(tmp_path):
     seams = ForkAdapter().seams_for(fork(tmp_path))
     still = [each.attribute.split(".")[1] for each in seams if each.role is Role.STILL]

@@ -28,6 +28,7 @@ MODEL = """
 
     def create_from_pcd(self, pcd):
         scales = torch.log(distances)[..., None].repeat(1, 3)
+        self._scaling = nn.Parameter(scales.requires_grad_(True))
 
     def construct_list_of_attributes(self):
         names = ["x", "y", "z", "nx", "ny", "nz", "opacity"]
@@ -136,6 +137,7 @@ def test_the_nearest_host_is_of_this_family(fork):
         ('"opacity"]', '"opacity", "binding_0"]', "binding, positions relative to the triangles"),
         ('names.append("f_dc_{}".format(i))', "...", "lacks the columns f_dc"),
         (".repeat(1, 3)", ".repeat(1, 2)", "flat, with two scales"),
+        (".repeat(1, 3)", "", "its Gaussians are round, with one scale"),
         ("= self._opacity.detach()", "= self.get_opacity.detach()", "stores activated values"),
         ("scaling_activation = torch.exp", "scaling_activation = softplus", "is softplus"),
         (
@@ -196,6 +198,7 @@ def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):
             "rotations=rotations\n    )\n    opacity = pc.net(image)\n",
         ),
         ("rotations=rotations\n    )\n", "rotations=rotations\n    )\n    image = image[:3]\n"),
+        (".repeat(1, 3)", "\n        scales = scales if self.round else scales.repeat(1, 3)"),
     ],
 )
 def test_what_leaves_the_picture_alone_is_plain(fork, old, new):
@@ -211,6 +214,30 @@ def test_what_is_never_saved_or_drawn_is_not_plain(fork, tmp_path):
     renderer.rename(tmp_path / "drawing.py")
     found = read_plain(HostRepo(tmp_path)).reasons[0]
     assert found.endswith("there is no gaussian_renderer, but drawing.py")
+
+
+@pytest.mark.parametrize(
+    ("made", "reason"),
+    [
+        ("image = a + b * 0.5", "adds several pictures, a + b * 0.5"),
+        ("loss = l1(a, photograph) + l1(b, photograph)", None),
+        ("image = a + background", None),
+    ],
+)
+def test_a_picture_of_several_models_is_not_that_of_one_ply(fork, tmp_path, made, reason):
+    fork()
+    script = tmp_path / "train.py"
+    drawn = 'a, b = render(view, one)["render"], render(view, other)["render"]'
+    script.write_text(script.read_text() + f"\n\ndef train():\n    {drawn}\n    {made}\n")
+    reasons = read_plain(HostRepo(tmp_path)).reasons
+    assert (reason in reasons[0]) if reason else not reasons
+
+
+def test_a_scene_by_another_name_is_saved_too(fork, tmp_path):
+    fork()
+    script = tmp_path / "train.py"
+    script.write_text(script.read_text().replace("scene.save(", "scene_static.save("))
+    assert read_plain(HostRepo(tmp_path))
 
 
 def test_the_drawing_that_a_training_script_names_decides(fork, tmp_path):
@@ -238,6 +265,25 @@ def test_a_model_in_a_folder_may_be_saved_by_a_script_above(fork, tmp_path):
     assert judged(HostRepo(tmp_path)).reason == "inner/: none of its scripts saves a PLY"
     (tmp_path / "slam.py").write_text(saving)
     assert judged(HostRepo(tmp_path)).kind == "finetune"
+
+
+def test_a_model_beside_the_codebase_that_draws_does_not_count(fork, tmp_path):
+    fork(root=tmp_path / "inner")
+    fork(("return self._xyz", "return self.net()"))
+    renderer = tmp_path / "gaussian_renderer/__init__.py"
+    assert judged(HostRepo(tmp_path)).kind == "never"
+    renderer.unlink()
+    renderer.parent.rmdir()
+    assert judged(HostRepo(tmp_path)).kind == "finetune"
+
+
+def test_a_class_that_lists_no_columns_is_no_model(fork, tmp_path):
+    fork()
+    scene = tmp_path / "scene"
+    (scene / "gaussian_model.py").unlink()
+    saving = "class Scene:\n    def save_ply(self, path): self.gaussians.save_ply(path)\n"
+    (scene / "__init__.py").write_text(saving)
+    assert judged(HostRepo(tmp_path)).reason == "no model of this family that saves a PLY was found"
 
 
 def test_a_model_that_is_not_in_the_checkout_is_looked_for_in_its_submodules(tmp_path):
@@ -293,6 +339,9 @@ def test_another_model_that_a_script_trains_counts_if_it_stores_something_else(f
     assert "Folded, which a script here trains: save_ply stores a product" in str(
         read_plain(HostRepo(tmp_path)).reasons
     )
+    script = tmp_path / "train.py"
+    script.write_text("from scene import GaussianModel\n" + script.read_text())
+    assert read_plain(HostRepo(tmp_path))  # that script trains the plain model alone
 
 
 def test_a_folder_that_does_not_fit_gives_its_reason_at_the_root(fork, tmp_path):

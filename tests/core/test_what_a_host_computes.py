@@ -124,6 +124,35 @@ def test_every_rasterizer_of_the_name_counts(tmp_path):
     assert ["submodules/b/cuda" in error for error in found] == [True]
 
 
+def test_a_source_that_is_not_compiled_is_not_read(tmp_path):
+    vendor(tmp_path)
+    project = tmp_path / "submodules/a"
+    other = "float alpha = min(0.99f, c.w * area(d));"
+    (project / "cuda/trials").mkdir()
+    (project / "cuda/trials/forward.cu").write_text(PROJECTION % (EWA, WIDENED) + BLEND % other)
+    setup = 'setup(ext_modules=[CUDAExtension("_C", ["cuda/forward.cu", "ext.cpp"])])'
+    (project / "setup.py").write_text(setup)
+    assert not errors(skeleton(tmp_path / "."))
+    (project / "cuda/ext.h").write_text('#include "trials/forward.cu"\n')
+    assert "no exp()" in errors(HostRepo(tmp_path))[0]
+    (project / "cuda/ext.h").unlink()
+    (project / "setup.py").write_text("setup(ext_modules=[CUDAExtension('_C', glob('cuda/*'))])")
+    assert "no exp()" in errors(HostRepo(tmp_path))[0]
+
+
+def test_modules_that_are_imported_under_other_names_are_refused(tmp_path):
+    """Those are other modules, which no seam reaches."""
+    repo = skeleton(tmp_path)
+    renderer = tmp_path / "gaussian_renderer/__init__.py"
+    text = renderer.read_text()
+    inside = "try:\n    import scene\nexcept ImportError:\n    import src.scene.gaussian_model\n"
+    renderer.write_text(inside + text)
+    assert not errors(HostRepo(tmp_path))
+    renderer.write_text("from splatting.scene.gaussian_model import GaussianModel\n" + text)
+    assert "splatting.scene.gaussian_model" in errors(HostRepo(tmp_path))[0]
+    assert repo.root == tmp_path
+
+
 def test_surfels_have_a_rule_of_their_own(tmp_path):
     """A rasterizer of surfels has no projection of covariances."""
     surfel = "diff_surfel_rasterization"
