@@ -11,9 +11,6 @@ from fragprune_plugins.hosts.adapter import HostAdapter, ScriptAdapter
 from fragprune_plugins.hosts.findings import Finding, Match
 from fragprune_plugins.hosts.source import HostRepo
 
-_SHORT = 100
-"""Characters of a line that sums an adapter up."""
-
 
 @dataclass(frozen=True)
 class Tried:
@@ -53,9 +50,8 @@ class Tried:
         )
 
     def brief(self) -> str:
-        """The verdict and the first error, if any, in one short line."""
-        line = self.verdict() + (f"; {self.errors[0].found}" if self.errors else "")
-        return line if len(line) <= _SHORT else f"{line[: _SHORT - 3].rstrip()}..."
+        """The verdict and the first error, if any, in one line."""
+        return self.verdict() + (f"; {self.errors[0].found}" if self.errors else "")
 
 
 def attempt(repo: HostRepo, adapters: Sequence[HostAdapter]) -> list[Tried]:

@@ -38,7 +38,8 @@ def test_a_page_of_somebody_else_is_not_overwritten(cut_scene, tmp_path, name):
     own = tmp_path / "website" / "index.html"
     own.parent.mkdir()
     own.write_text("<!doctype html><title>My site</title>")
-    fails("view", path, "--out", own.parent / name, says="did not write", code=1)
+    says = ("did not write", "Choose another --out, or delete the page.")
+    fails("view", path, "--out", own.parent / name, says=says, code=1)
     assert own.read_text().endswith("My site</title>")
     assert list(own.parent.iterdir()) == [own]
 

@@ -61,6 +61,19 @@ def test_a_room_is_looked_at_from_inside(seed):
         assert (view.campos.abs() < torch.tensor([3.0, 1.5, 2.5])).all()
 
 
+@pytest.mark.parametrize("side", [-1, 1])
+def test_what_is_shown_first_is_the_front_and_from_above(side):
+    """A board, painted on one side and plain on the other; y is down."""
+    across = torch.linspace(-1, 1, 40)
+    board = torch.cartesian_prod(torch.tensor([-0.3, 0.3]), across, across)
+    model = splat(board, 0.04)
+    squares = ((board[:, 1:] * 4).floor().sum(dim=1) % 2)[:, None, None].expand(-1, 1, 3)
+    model.f_dc[:] = torch.where(board[:, :1, None] * side > 0, 3 * squares - 1.5, 0.0)
+    views = [view for _, view in place(model, 12, ENGINE, side="orbit", divide=10).views]
+    assert side * float(views[0].campos[0]) > 0
+    assert [bool(view.campos[1] < 0) for view in views] == 6 * [True] + 6 * [False]
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_an_object_is_looked_at_from_outside(seed):
     placed = place(thing(seed), 8, ENGINE)

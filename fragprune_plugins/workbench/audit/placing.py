@@ -74,7 +74,7 @@ def place(
     """
     pixels = 800 // divide
     if side == "orbit":
-        return Placed(_orbit(splat, count, pixels), side, "As asked for.", math.nan)
+        return Placed(_orbit(splat, count, pixels, engine), side, "As asked for.", math.nan)
     splats, near = splat.splats(), _NEAR * bounds(splat)[1]
     places = _clear(splat, near / _NEAR)
     shares = [enclosed(engine, splats, at, near) for at in places]
@@ -85,7 +85,7 @@ def place(
             f"directions end on a distant surface, and in a room more than {ENCLOSED:.0%} do. "
             "If it is a room, pass --inside."
         )
-        return Placed(_orbit(splat, count, pixels), "orbit", why, best)
+        return Placed(_orbit(splat, count, pixels, engine), "orbit", why, best)
     good = [at for at, share in zip(places, shares, strict=True) if share >= _AS_GOOD * best]
     eyes = good[:_PLACES]  # the most open ones
     if side == "inside":
@@ -103,10 +103,31 @@ def place(
     return Placed(chosen[:count], "inside", why, best)
 
 
-def _orbit(splat: Model, count: int, pixels: int) -> Named:
-    """Cameras all around, from above first: worlds of COLMAP, which most are, have y down."""
-    views = around(splat, count, pixels=pixels)
-    return sorted(views, key=lambda named: float(named[1].campos[1]))
+def _orbit(splat: Model, count: int, pixels: int, engine: Engine) -> Named:
+    """Cameras all around; from above first, and of those the one that sees most.
+
+    From above is where y is less: worlds of COLMAP, which most are, have y down.
+    """
+    centre, splats = bounds(splat)[0], splat.splats()
+    return sorted(
+        around(splat, count, pixels=pixels),
+        key=lambda named: (
+            bool(named[1].campos[1] > centre[1]),
+            -_detail(engine, splats, named[1]),
+        ),
+    )
+
+
+def _detail(engine: Engine, splats: Splats, view: View) -> float:
+    """How much a small picture is filled, and how much its neighbouring pixels differ.
+
+    Backs of walls and haze show little, and so does a corner of an object.
+    """
+    view = _small(view).to(splats.device)
+    out = engine.rasterize(RasterInputs(view, splats), None)
+    image = out.image.clamp(0, 1)
+    differ = sum(float(image.diff(dim=dim).abs().mean()) for dim in (1, 2))
+    return differ * float(out.alpha.mean())
 
 
 def _small(view: View) -> View:

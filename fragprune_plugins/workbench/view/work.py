@@ -160,6 +160,6 @@ def _expect_our_page(page: Path) -> None:
         raise OutputError(
             str(page),
             "a page that fragprune view did not write",
-            "a folder of its own",
-            "Name one.",
+            "no page there, or one of fragprune view",
+            "Choose another --out, or delete the page.",
         )
