@@ -115,7 +115,7 @@ def test_a_host_that_fits_needs_no_line_of_any_other_adapter(host):
     assert "others do not fit (--adapter NAME says why)" in text
 
 
-def test_one_that_fits_none_has_a_short_line_for_each_of_the_nearest(host):
+def test_one_that_fits_none_has_the_whole_reason_of_each_of_the_nearest(host):
     mutations.rename_function(HostRepo(host), CLONE)
     lines = [line for line in run("check", host).stdout.splitlines() if "does not fit" in line]
     assert lines[0].startswith("3dgs-fork does not fit: ")
@@ -123,7 +123,7 @@ def test_one_that_fits_none_has_a_short_line_for_each_of_the_nearest(host):
     assert lines[1].startswith(
         "vanilla-3dgs does not fit: 14 of 15 seams hold; no GaussianModel.densify_and_clone"
     )
-    assert max(map(len, lines)) <= 100
+    assert not any(line.endswith("...") for line in lines)
 
 
 def test_packages_that_it_imports_and_that_are_not_here_are_listed(host):
