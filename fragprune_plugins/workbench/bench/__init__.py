@@ -56,7 +56,7 @@ RULES = (
 )
 @engine_options()
 def command(**options: Any) -> Report:
-    """Time rasterization, forward and with all gradients, with and without truncation.
+    """Time rasterization, forward and with all gradients, with and without cutoffs.
 
     MODEL is drawn with its own cutoffs. Without MODEL a scene is generated, the same on every
     machine. All rows are timed in turns, so that a busy machine slows them alike. Close other

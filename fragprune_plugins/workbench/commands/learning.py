@@ -73,7 +73,7 @@ _OPTIONS = (
     click.option(
         "--target-speedup",
         type=float,
-        help="Target for the ratio of fragments: those of the untruncated model at the start, "
+        help="Target for the ratio of fragments: those of the original without cutoffs, "
         "divided by those drawn now, on the training views that calibration measures.",
     ),
     click.option(
@@ -101,7 +101,7 @@ _OPTIONS = (
     click.option(
         "--control",
         is_flag=True,
-        help="Run the same iterations without truncation, to compare with.",
+        help="Run the same iterations without pruning, to compare with.",
     ),
 )
 
@@ -123,7 +123,7 @@ _OF_FINETUNE = (
     click.option(
         "--target-time",
         type=float,
-        help="Target for the ratio of frame times: the untruncated model's at the start, divided "
+        help="Target for the ratio of frame times: those of the original without cutoffs, divided "
         "by those now, on this machine, at the size of the training views. 1.5 means frames 1.5 "
         "times as fast.",
     ),
@@ -131,7 +131,7 @@ _OF_FINETUNE = (
         "--max-drop",
         type=Number(0, 10),
         metavar="DB",
-        help="Find the strongest truncation that loses at most so much PSNR, in dB, against the "
+        help="Find the strongest pruning that loses at most so much PSNR, in dB, against the "
         "control. Trains the control and up to 7 times more, and chooses the pressure on the "
         "held-out views.",
     ),

@@ -155,7 +155,7 @@ def outcome(command: str, data: dict[str, Any], control: dict[str, Any] | None) 
         )
     else:
         said = (
-            f"{gained}. The control, as many iterations without truncation, has "
+            f"{gained}. The control, as many iterations without pruning, has "
             f"{control['fragments_per_pixel']:.1f} fragments per pixel and "
             f"{control['psnr'] - before['psnr']:+.2f} dB: pruning itself makes "
             f"{_by_pruning(before, after, control):+.2f} dB."

@@ -74,7 +74,7 @@ RULES = (
     Alone(("--self", "--max-drop"), "photographs, and with them a control to lose against"),
     Alone(
         ("--self", "--control"),
-        "something to learn: without truncation the model is its own target already",
+        "something to learn: without pruning the model is its own target already",
     ),
     Alone(("--self 1", "--keep auto"), "photographs, whose error says what can be spared"),
     *apart("--shard-gaussians", "--self", "--portable", expected=_PARTS),

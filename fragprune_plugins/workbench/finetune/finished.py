@@ -250,7 +250,7 @@ def _describe_bound(found: dict[str, Any], views: int) -> str:
     if "loss" not in found:
         return "No training was compared with the control."
     tried = f"of {len(found['trials'])} trained"
-    chosen = f"the strongest truncation {tried}" if found["met"] else f"the least loss {tried}"
+    chosen = f"the strongest pruning {tried}" if found["met"] else f"the least loss {tried}"
     missed = "" if found["met"] else f" The bound of {found['bound']:g} dB was missed."
     return (
         f"Loss against the control: {found['loss']:.3f} dB at pressure {found['pressure']:.2g}, "

@@ -105,7 +105,7 @@ def strongest(
     if not isinstance(settings.goal, AtMost):
         raise UsageError("goal", str(settings.goal), "AtMost(decibels)", "Pass such a goal.")
     search = _Search(settings.goal.decibels, say)
-    say("Training the control, without truncation.")
+    say("Training the control, without pruning.")
     search.last = search.control = control = train(replace(settings, goal=Control()))
     if control.interrupted:
         return search.ended(control.terminated)

@@ -33,7 +33,7 @@ from fragprune_plugins.workbench.scenes.dataset import load_photographs
 
 _WHERE = {"joint": "inside the training"}
 _CONTROL = (
-    "To see what truncation did, train as long with --stage off and another output folder, and run "
+    "To see what pruning did, train as long with --stage off and another output folder, and run "
     "fragprune compare."
 )
 """Joint learning has no model of before."""
