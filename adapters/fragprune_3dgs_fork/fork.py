@@ -215,13 +215,7 @@ def _read_scripts(fork: Fork, scripts: tuple[str, ...]) -> None:
         tree = repo.tree(_module(script))
         assert tree is not None  # it is a candidate
         networks = _networks(repo, script)
-        made = [
-            name
-            for node in nodes(tree)
-            if isinstance(node, ast.Call)
-            and (name := getattr(node.func, "id", "")).endswith("Model")
-            and name not in networks
-        ]
+        made = [each for each in reading.made_models(repo, _module(script)) if each not in networks]
         if CLASS in made and len(set(made)) == 1:
             fork.scripts += (script,)
             if len(made) > 1 or _in_loop(tree, CLASS):

@@ -16,6 +16,7 @@ from fragprune_graphdeco.densifying import clones, splits
 from fragprune_graphdeco.kernels import SPLAT, Kernel, read_kernels, vendored
 from fragprune_graphdeco.reading import (
     defaults,
+    made_models,
     read_flags,
     read_getters,
     renamed,
@@ -275,6 +276,10 @@ class GraphdecoAdapter(ScriptAdapter):
         missing = [
             f"no {name}" for name in self.scripts_of(repo) if not (repo.root / name).is_file()
         ]
+        for script in self.scripts_of(repo):
+            made = made_models(repo, script.removesuffix(".py").replace("/", "."))
+            if made and "GaussianModel" not in made:
+                missing.append(f"{script} makes {', '.join(dict.fromkeys(made))}")
         for module, _, name in (each.rpartition(":") for each in self.own_names):
             module = module or MODEL
             missing += [] if repo.mentions([module], [name]) else [f"no {name} in {module}"]

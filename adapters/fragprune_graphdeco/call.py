@@ -137,7 +137,7 @@ def _drawn(
     assigned = [node for node in nodes(body) if isinstance(node, ast.Assign)]
     targets = {id(node.value): node.targets[0] for node in assigned}
     rasterizers = {
-        node.targets[0].id: imported.package(node.value)
+        node.targets[0].id: node.value
         for node in assigned
         if imported.of(node.value, RASTERIZER) and isinstance(node.targets[0], ast.Name)
     }
@@ -149,11 +149,13 @@ def _drawn(
         if own or getattr(called, "id", None) in rasterizers:
             target = targets.get(id(node), node)
             values = target.elts if isinstance(target, ast.Tuple) else []
+            made: ast.Call = called if own else rasterizers[called.id]  # type: ignore[attr-defined, assignment]
+            keywords = [each for each in made.keywords if each.arg != "raster_settings"]
             yield (
                 target.lineno,
-                imported.package(called) if own else rasterizers[called.id],  # type: ignore[attr-defined]
+                imported.package(made),
                 tuple(getattr(each, "id", "") for each in values),
-                {each.arg: each.value for each in node.keywords if each.arg},
+                {each.arg: each.value for each in [*keywords, *node.keywords] if each.arg},
             )
 
 

@@ -15,7 +15,7 @@ from weakref import WeakKeyDictionary
 
 from fragprune_graphdeco.call import RASTERIZER
 from fragprune_graphdeco.kernels import SPLAT, read_kernels
-from fragprune_graphdeco.reading import computed, defaults, without
+from fragprune_graphdeco.reading import computed, defaults, made_models, without
 from fragprune_plugins.adapting import (
     Function,
     HostRepo,
@@ -88,15 +88,16 @@ def _read_plain(repo: HostRepo) -> Plain:
     moving |= (getters := dict(_of_getters(repo, module, name)))
     reasons = [
         *flat,
+        *getters,
         *made,
         *_of_columns(repo, module, name),
         *(() if flat else _of_kernel(repo)),
         *drawn,
         *_of_saving(repo, module, name),
         *_of_positions(repo, module, name),
-        *getters,
         *_of_others(repo, module, name),
         *_of_scripts(repo),
+        *_of_makers(repo, name),
     ]
     moved = frozenset(each for each, moves in moving.items() if moves)
     elsewhere = "" if repo.path("scene.gaussian_model") else f"{name} is in {module}"
@@ -226,6 +227,8 @@ def _of_saving(repo: HostRepo, module: str, name: str) -> Iterator[str]:
 def _of_getters(repo: HostRepo, module: str, name: str) -> Iterator[tuple[str, bool]]:
     """Getters of other values than the PLY's; true if only where an attribute was set later."""
     saved = ast.unparse(repo.function(module, f"{name}.save_ply") or ast.Pass())
+    if repo.function(module, f"{name}.get_xyz") is None:  # a class that only saves
+        module, name = "scene.gaussian_model", "GaussianModel"
     for kind in ("xyz", "opacity", "scaling", "rotation"):
         body = repo.function(module, f"{name}.get_{kind}")
         at = repo.place(module, f"{name}.get_{kind}")
@@ -306,6 +309,14 @@ def _of_scripts(repo: HostRepo) -> Iterator[str]:
         yield from _of_sums(repo, script)
 
 
+def _of_makers(repo: HostRepo, model: str) -> Iterator[str]:
+    """A model that every training script makes in place of the one that was read."""
+    made = {each: name for each in _training(repo) for name in made_models(repo, each)}
+    if made and not repo.mentions(_training(repo), [model]):
+        script, name = next(iter(made.items()))
+        yield f"its PLY was not read: {script}.py trains {name}, not {model}"
+
+
 def _of_sums(repo: HostRepo, script: str) -> Iterator[str]:
     """A picture that a training script adds up of several drawings."""
     tree, drawn = repo.tree(script), set[str]()
@@ -357,8 +368,10 @@ def _of_kernel(repo: HostRepo) -> Iterator[str]:
 def _renderers(repo: HostRepo) -> list[str]:
     """Modules of the drawing functions."""
     own = "gaussian_renderer"
-    files = sorted((repo.root / own).glob("*.py"), key=lambda each: each.stem != "__init__")
-    stems = [each.stem for each in files] or ["__init__"] * (repo.path(own) is not None)
+    files = (each.stem for each in (repo.root / own).glob("*.py"))
+    stems = sorted(files, key=lambda stem: (stem != "__init__", stem)) or ["__init__"] * (
+        repo.path(own) is not None
+    )
     return [own if each == "__init__" else f"{own}.{each}" for each in stems]
 
 

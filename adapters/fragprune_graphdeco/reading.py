@@ -50,6 +50,13 @@ def read_getters(
     ]
 
 
+def made_models(repo: HostRepo, module: str) -> list[str]:
+    """Classes of models that a script makes, by their names, once for each place."""
+    made = [node.func for node in nodes(repo.tree(module)) if isinstance(node, ast.Call)]
+    names = [getattr(each, "id", "") for each in made]
+    return [name for name in names if name.endswith("Model") or name.startswith("GaussianModel")]
+
+
 _ELSEWHERE = re.compile(r"\w+(?:\.\w+)*\.(?:scene(?:\.\w+)*|gaussian_renderer)")
 
 
@@ -62,8 +69,13 @@ def renamed(repo: HostRepo) -> list[str]:
         if isinstance(node, ast.Import | ast.ImportFrom)
         for name in repo.imported_by(module, node)[:1]
         for path in [repo.at(module, node.lineno)]
-        if _ELSEWHERE.fullmatch(name) and not repo.path(name.split(".")[0])
+        if _ELSEWHERE.fullmatch(name) and not _there(repo, name.split(".")[0])
     ][:1]
+
+
+def _there(repo: HostRepo, name: str) -> bool:
+    """Whether a checkout has a module or a folder of this name."""
+    return repo.path(name) is not None or (repo.root / name).is_dir()
 
 
 def is_property(function: Function) -> bool:

@@ -50,9 +50,9 @@ def rasterizer(
     class GaussianRasterizer(nn.Module):
         """Stand-in of fragprune for the compiled rasterizer."""
 
-        def __init__(self, raster_settings: Any) -> None:
+        def __init__(self, raster_settings: Any, **more: Any) -> None:
             super().__init__()
-            self.raster_settings = raster_settings
+            self.raster_settings, self.more = raster_settings, more
 
         def markVisible(self, positions: Tensor) -> Tensor:  # noqa: N802 - the host's name
             """(P,) bool: in front of the near plane."""
@@ -64,7 +64,8 @@ def rasterizer(
     def entry(name: str) -> Callable[..., Any]:
         def call(self: GaussianRasterizer, *given: Any, **named: Any) -> Any:
             """Draw; see the adapter's dialect for what comes back."""
-            arguments = dict.fromkeys(_TAKEN) | dict(zip(_TAKEN, given, strict=False)) | named
+            taken = dict(zip(_TAKEN, given, strict=False))
+            arguments = dict.fromkeys(_TAKEN) | self.more | taken | named
             where = f"{package}:GaussianRasterizer.{name}"
             return draw(HostCall(self.raster_settings, arguments, where))
 

@@ -127,6 +127,7 @@ OFF = {
     "False": (", mult=False", []),
     "a parameter": (", mult=mult", [("chosen=None", "chosen=None, mult=None")]),
     "an option": (", mult=pipe.mult", []),
+    "of the rasterizer itself": ("", [("settings=s)", "settings=s, mult=pipe.mult)")]),
 }
 OPTIONS = """
 class PipelineParams:

@@ -108,6 +108,13 @@ def test_the_rasterizer_takes_positional_and_keyword_calls_alike():
     assert list(draw.parameters()) == []
 
 
+def test_what_a_rasterizer_is_made_with_comes_with_every_call():
+    module = rasterizer()
+    settings = module.GaussianRasterizationSettings("background", "viewmatrix", False)
+    call = module.GaussianRasterizer(settings, profile=True)(1, 2, 3)
+    assert call["profile"] is True
+
+
 @pytest.mark.parametrize("sparse", [False, True])
 def test_sparse_adam_is_there_only_for_hosts_that_look_for_it(sparse):
     """Its mere presence makes a late-2024 host call with separate bands."""

@@ -277,6 +277,25 @@ def test_a_model_beside_the_codebase_that_draws_does_not_count(fork, tmp_path):
     assert judged(HostRepo(tmp_path)).kind == "finetune"
 
 
+def test_a_script_that_trains_another_model_fits_nothing(tmp_path):
+    skeleton(tmp_path)
+    script = tmp_path / "train.py"
+    text = script.read_text()
+    script.write_text(f"{text}\nmodel = GaussianModel(3)\nmodel = DeformModel(3)\n")
+    assert judged(HostRepo(tmp_path)).kind == "fits"
+    for other in "MeshModel", "GaussianModelDyn":
+        script.write_text(f"{text}\nfrom mesh import {other}\nmodel = {other}(3)\n")
+        assert judged(HostRepo(tmp_path)).kind == "never"
+
+
+def test_a_ply_of_a_model_that_was_not_read_is_not_plain(fork, tmp_path):
+    fork()
+    script = tmp_path / "train.py"
+    script.write_text(f"{script.read_text()}\nfrom mesh import MeshModel\nmodel = MeshModel(3)\n")
+    found = "its PLY was not read: train.py trains MeshModel, not GaussianModel"
+    assert judged(HostRepo(tmp_path)).reason == found
+
+
 def test_a_class_that_lists_no_columns_is_no_model(fork, tmp_path):
     fork()
     scene = tmp_path / "scene"
