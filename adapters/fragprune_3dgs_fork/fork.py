@@ -526,7 +526,7 @@ def read_getters(fork: Fork) -> list[Finding]:
         unset = {each for each in asked if fork.is_off(each)} - made
         if not stored:
             found += reading.read_getters(fork.repo, MODEL, unset)
-        elif body and not plain.activates(body, stored, unset):
+        elif body and not reading.activates(body, stored, unset):
             at = fork.repo.place(MODEL, f"{CLASS}.{getter}")
             found.append(Finding.error("model-getter", at, f"{getter} is computed", stored))
     return found

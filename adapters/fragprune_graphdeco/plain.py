@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from weakref import WeakKeyDictionary
 
 from fragprune_graphdeco.call import RASTERIZER
 from fragprune_graphdeco.kernels import SPLAT, read_kernels
-from fragprune_graphdeco.reading import computed, defaults, made_models, without
+from fragprune_graphdeco.reading import ACTIVATIONS, activates, defaults, made_models, returns
 from fragprune_plugins.adapting import (
     Function,
     HostRepo,
@@ -40,16 +40,8 @@ _OF_CALL = re.compile(
     r"opacity|opacities|features|shs|rotations?|\w*sh\w*"
 )
 """Parameters of a drawing function that move or select Gaussians, or are their values."""
-_SHAPES = {"repeat", "expand", "view", "reshape", "squeeze", "unsqueeze", "contiguous"}
-"""Methods that change how often or in what shape a value stands, not the value."""
 _SAVES = re.compile(r"\.save_ply\(|scene\w*\.save\(")
 _UNSAVED = "none of its scripts saves a PLY"
-_FUNCTIONAL = ("torch.nn.functional", "nn.functional", "F")
-_ACTIVATIONS = {
-    "scaling_activation": ("torch.exp",),
-    "opacity_activation": ("torch.sigmoid",),
-    "rotation_activation": tuple(f"{each}.normalize" for each in _FUNCTIONAL),
-}
 
 
 def read_models(repo: HostRepo) -> list[Plain]:
@@ -208,7 +200,8 @@ def _of_saving(repo: HostRepo, module: str, name: str) -> Iterator[str]:
                     yield f"save_ply stores activated values, {target} = {value[:60]} ({at})"
         if target in ("opacities", "scale") and (got := re.match(r"self\.(get_\w+_\w+)", value)):
             getter = repo.function(module, f"{name}.{got[1]}")
-            if getter is None or computed(getter, {"scale": "_scaling"}.get(target, "_opacity")):
+            stored = {"scale": "_scaling"}.get(target, "_opacity")
+            if getter is None or returns(getter, stored) != {"stored"}:
                 yield f"save_ply stores other values, {target} = {value[:60]} ({at})"
         if target in ("f_dc", "f_rest", "opacities", "scale", "rotation"):
             if re.match(r"np\.(zeros|ones)", value):
@@ -219,7 +212,7 @@ def _of_saving(repo: HostRepo, module: str, name: str) -> Iterator[str]:
     for node in nodes(setup):
         if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Attribute):
             attribute, value = node.targets[0].attr, ast.unparse(node.value)
-            expected = _ACTIVATIONS.get(attribute, (value,))
+            expected = ACTIVATIONS.get(attribute, (value,))
             if value not in expected and raw.get(attribute.removesuffix("_activation"), True):
                 yield f"its {attribute} is {value[:50]} ({repo.at(module, node.lineno)})"
 
@@ -242,41 +235,6 @@ def _of_getters(repo: HostRepo, module: str, name: str) -> Iterator[tuple[str, b
         called = ast.unparse(node.func) if isinstance(node, ast.Call) else "torch.cat"
         if isinstance(node, ast.BinOp) or called != "torch.cat":
             yield f"get_features is computed ({repo.place(module, f'{name}.get_features')})", False
-
-
-def activates(getter: Function, stored: str, unset: Collection[str] = ()) -> bool:
-    """Whether a getter returns rows of an attribute, activated if they are no positions.
-
-    What it does where attributes in ``unset`` are not None does not count.
-    """
-    activation = f"{stored[1:]}_activation"
-    activations = (f"self.{activation}", *_ACTIVATIONS.get(activation, ()))
-    wanted = "activated" if activation in _ACTIVATIONS else "stored"
-    known: dict[str, str] = {}
-
-    def state(value: ast.expr | None) -> str:
-        while isinstance(value, ast.Call) and getattr(value.func, "attr", "") in _SHAPES:
-            value = value.func.value  # type: ignore[attr-defined]
-        if isinstance(value, ast.Call) and len(value.args) == 1 and not value.keywords:
-            stands = ast.unparse(value.func) in activations and state(value.args[0]) == "stored"
-            return "activated" if stands else "computed"
-        if isinstance(value, ast.Name):
-            return known.get(value.id, "computed")
-        return "stored" if value and ast.unparse(value) == f"self.{stored}" else "computed"
-
-    skipped = without(getter, unset)
-    for statement in getter.body:
-        for node in (each for each in nodes(statement) if id(each) not in skipped):
-            if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
-                name, made = node.targets[0].id, state(node.value)
-                if node is not statement and name in known:  # in one branch of several
-                    rows = rf"self\.{stored}_?\w*|{name}\[\w+\]"
-                    chosen = made == known[name] or re.fullmatch(rows, ast.unparse(node.value))
-                    made = known[name] if chosen else "computed"
-                known[name] = made
-    body = [node for node in nodes(getter) if id(node) not in skipped]
-    returned = [node for node in body if isinstance(node, ast.Return)]
-    return bool(returned) and all(state(each.value) == wanted for each in returned)
 
 
 def _of_positions(repo: HostRepo, module: str, name: str) -> Iterator[str]:

@@ -10,6 +10,15 @@ from fragprune_plugins.adapting import CommandLine, Finding, Function, HostRepo,
 
 GETTERS = ("get_xyz", "get_opacity")
 """Properties of the model that every adapter of this family reads."""
+_SHAPES = {"repeat", "expand", "view", "reshape", "squeeze", "unsqueeze", "contiguous"}
+"""Methods that change how often or in what shape a value stands, not the value."""
+_FUNCTIONAL = ("torch.nn.functional", "nn.functional", "F")
+ACTIVATIONS = {
+    "scaling_activation": ("torch.exp",),
+    "opacity_activation": ("torch.sigmoid",),
+    "rotation_activation": tuple(f"{each}.normalize" for each in _FUNCTIONAL),
+}
+"""What activates each kind of value of a plain model."""
 _OTHER_FLAGS = ("hydra", "omegaconf", "tyro", "jsonargparse", "fire", "gin", "click", "absl")
 
 
@@ -23,31 +32,22 @@ def read_getters(
     """
     found = []
     for name in GETTERS if repo.tree(module) else ():  # if not, the seams say so
-        function = repo.function(module, f"{model}.{name}")
+        function, hint = repo.function(module, f"{model}.{name}"), ""
+        itself = " that returns self._xyz, the parameter itself" if name == "get_xyz" else ""
         if function is None:
-            what: str | None = "no such property"
+            what = "no such property"
         elif not is_property(function):
             what = "a method"
-        elif name == "get_xyz":
-            what = computed(function, "_xyz", unset)
+        elif itself and returns(function, "_xyz", unset) != {"stored"}:
+            made = [each.value for each in nodes(function) if isinstance(each, ast.Return)]
+            ends = " or ".join(ast.unparse(each) for each in made if each)
+            what = f"computed, it returns {ends[:60] or 'nothing'}"
+            hint = "Thresholds follow the rows of the parameter, which these are not."
         else:
-            what = None
-        if what:
-            found.append((name, what))
-    return [
-        Finding.error(
-            "model-getter",
-            f"{module}:{model}.{name} ({repo.place(module, f'{model}.{name}')})",
-            what,
-            "a property that returns self._xyz, the parameter itself"
-            if name == "get_xyz"
-            else "a property",
-            "Thresholds follow the rows of the parameter, which these are not."
-            if what.startswith("computed")
-            else "",
-        )
-        for name, what in found
-    ]
+            continue
+        at = f"{module}:{model}.{name} ({repo.place(module, f'{model}.{name}')})"
+        found.append(Finding.error("model-getter", at, what, f"a property{itself}", hint))
+    return found
 
 
 def made_models(repo: HostRepo, module: str) -> list[str]:
@@ -83,25 +83,47 @@ def is_property(function: Function) -> bool:
     return any("property" in ast.unparse(each) for each in function.decorator_list)
 
 
-def computed(function: Function, attribute: str, unset: Collection[str] = ()) -> str | None:
-    """How a getter computes its value; None if it always returns an attribute of ``self``.
+def activates(getter: Function, stored: str, unset: Collection[str] = ()) -> bool:
+    """Whether a getter returns rows of an attribute, activated if they are no positions.
 
     What it does where attributes in ``unset`` are not None does not count.
     """
-    skipped = without(function, unset)
-    body = [node for node in nodes(function) if id(node) not in skipped]
-    names, assigned = {f"self.{attribute}"}, [each for each in body if isinstance(each, ast.Assign)]
-    for node in assigned:
-        if ast.unparse(node.value) in names:
-            names |= {each.id for each in node.targets if isinstance(each, ast.Name)}
-    for node in assigned:
-        if ast.unparse(node.value) not in names:
-            names -= {ast.unparse(each) for each in node.targets}
-    returned = [node.value for node in body if isinstance(node, ast.Return)]
-    others = [ast.unparse(each) for each in returned if each and ast.unparse(each) not in names]
-    if others:
-        return f"computed, it returns {others[0][:60]}"
-    return None if returned else "computed, it returns nothing"
+    wanted = "activated" if f"{stored[1:]}_activation" in ACTIVATIONS else "stored"
+    return returns(getter, stored, unset) == {wanted}
+
+
+def returns(getter: Function, stored: str, unset: Collection[str] = ()) -> set[str]:
+    """What a getter returns: "stored" and "activated" rows of an attribute, or "computed" values.
+
+    Positions in another shape are computed: their rows may be others.
+    """
+    activation = f"{stored[1:]}_activation"
+    activations = (f"self.{activation}", *ACTIVATIONS.get(activation, ()))
+    shapes = _SHAPES if stored != "_xyz" else set()
+    known: dict[str, str] = {}
+
+    def state(value: ast.expr | None) -> str:
+        while isinstance(value, ast.Call) and getattr(value.func, "attr", "") in shapes:
+            value = value.func.value  # type: ignore[attr-defined]
+        if isinstance(value, ast.Call) and len(value.args) == 1 and not value.keywords:
+            stands = ast.unparse(value.func) in activations and state(value.args[0]) == "stored"
+            return "activated" if stands else "computed"
+        if isinstance(value, ast.Name):
+            return known.get(value.id, "computed")
+        return "stored" if value and ast.unparse(value) == f"self.{stored}" else "computed"
+
+    skipped = without(getter, unset)
+    for statement in getter.body:
+        for node in (each for each in nodes(statement) if id(each) not in skipped):
+            if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+                name, made = node.targets[0].id, state(node.value)
+                if node is not statement and name in known:  # in one branch of several
+                    rows = rf"self\.{stored}_?\w*|{name}\[\w+\]"
+                    chosen = made == known[name] or re.fullmatch(rows, ast.unparse(node.value))
+                    made = known[name] if chosen else "computed"
+                known[name] = made
+    body = [node for node in nodes(getter) if id(node) not in skipped]
+    return {state(node.value) for node in body if isinstance(node, ast.Return)}
 
 
 def without(function: Function, unset: Collection[str]) -> set[int]:
