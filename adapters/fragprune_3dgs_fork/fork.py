@@ -165,11 +165,14 @@ def read_fork(repo: HostRepo) -> Fork:
         if fork.errors and len(fork.scripts) > 1:
             alone = {script: _read(repo, (script,)) for script in fork.scripts}
             if served := tuple(script for script, each in alone.items() if not each.errors):
+                others = fork.unserved
                 fork = _read(repo, served)
-                for script in (each for each in alone if each not in served):
-                    fork.unserved[script] = alone[script].errors[0].found
-                    why = f"{script}, which is not served: {fork.unserved[script]}"
-                    fork.warn("script", script, why)
+                refused = {
+                    name: each.errors[0].found for name, each in alone.items() if each.errors
+                }
+                fork.unserved = others | refused
+        for script, why in fork.unserved.items() if fork.scripts else ():
+            fork.warn("script", script, f"{script}, which is not served: {why}")
         _known[repo] = fork
     return _known[repo]
 
@@ -210,7 +213,7 @@ def _imported(repo: HostRepo, modules: Iterable[str]) -> dict[str, ast.Module]:
 
 def _read_scripts(fork: Fork, scripts: tuple[str, ...]) -> None:
     """Of these scripts, the training scripts of the model class: they make it once."""
-    repo, others = fork.repo, []
+    repo = fork.repo
     for script in scripts:
         tree = repo.tree(_module(script))
         assert tree is not None  # it is a candidate
@@ -221,9 +224,10 @@ def _read_scripts(fork: Fork, scripts: tuple[str, ...]) -> None:
             if len(made) > 1 or _in_loop(tree, CLASS):
                 fork.one_run = f"{script} makes several models"
         elif made:
-            others.append(f"{script} makes {', '.join(dict.fromkeys(made))}")
+            fork.unserved[script] = f"makes {', '.join(dict.fromkeys(made))}"
     if not fork.scripts:
-        found = "; ".join(others) or "no script that trains a GaussianModel"
+        others = "; ".join(f"{script} {why}" for script, why in fork.unserved.items())
+        found = others or "no script that trains a GaussianModel"
         fork.refuse("other-host", str(repo.root), found, "a *train*.py that makes GaussianModels")
     for script in fork.scripts:
         _check_script(fork, script)

@@ -89,7 +89,7 @@ def _read_plain(repo: HostRepo) -> Plain:
         *_of_positions(repo, module, name),
         *_of_others(repo, module, name),
         *_of_scripts(repo),
-        *_of_makers(repo, name),
+        *_of_makers(repo, module, name),
     ]
     moved = frozenset(each for each, moves in moving.items() if moves)
     elsewhere = "" if repo.path("scene.gaussian_model") else f"{name} is in {module}"
@@ -267,10 +267,11 @@ def _of_scripts(repo: HostRepo) -> Iterator[str]:
         yield from _of_sums(repo, script)
 
 
-def _of_makers(repo: HostRepo, model: str) -> Iterator[str]:
+def _of_makers(repo: HostRepo, module: str, model: str) -> Iterator[str]:
     """A model that every training script makes in place of the one that was read."""
     made = {each: name for each in _training(repo) for name in made_models(repo, each)}
-    if made and not repo.mentions(_training(repo), [model]):
+    only_saves = repo.function(module, f"{model}.get_xyz") is None
+    if made and not only_saves and not repo.mentions(_training(repo), [model]):
         script, name = next(iter(made.items()))
         yield f"its PLY was not read: {script}.py trains {name}, not {model}"
 

@@ -7,6 +7,7 @@ import pytest
 from miniatures.forks import fork
 
 from fragprune_3dgs_fork import ForkAdapter
+from fragprune_3dgs_fork.fork import read_fork
 from fragprune_plugins.adapting import EngineError, HostCall, NotComparedError, Role, UsageError
 from fragprune_plugins.hosts.choosing import attempt, choose
 from fragprune_plugins.hosts.source import HostRepo
@@ -243,6 +244,16 @@ def test_of_several_scripts_those_are_served_that_can_be(tmp_path):
             refused(scripts[1], [])
     warned = [each.found for each in ForkAdapter().match(repo).findings if each.level == "warning"]
     assert warned[0].startswith("training/train_more.py, which is not served: 2 places")
+
+
+def test_a_script_of_another_model_is_named_and_not_served(tmp_path):
+    repo = fork(tmp_path)
+    other = (tmp_path / "train.py").read_text().replace("GaussianModel(", "GaussianModelOfTime(")
+    (tmp_path / "train_time.py").write_text(other)
+    assert errors(repo) == []
+    assert read_fork(repo).unserved == {"train_time.py": "makes GaussianModelOfTime"}
+    with pytest.raises(UsageError, match="train_time"):
+        ForkAdapter().resumed_by(tmp_path / "train_time.py", [])
 
 
 def test_the_camera_is_found_by_its_name(tmp_path):
