@@ -1,22 +1,23 @@
-"""What calls of compiled code share: tensors as arrays, the inputs as a struct, memory, errors."""
+"""What calls of compiled code share: tensors as arrays, inputs as a struct, gradients, errors."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final, get_args
+from typing import Any, Final, get_args
 
 import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from fragprune_plugins.constants import THREADS_MAX
 from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.errors import EngineError
-from fragprune_plugins.types import Compensation, Splats
+from fragprune_plugins.types import Compensation, RasterInputs, Splats
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from fragprune_plugins.types import RasterInputs
+Wanted = frozenset[str]
+"""Inputs that gradients are wanted of, by the names of fragprune_input_grads."""
 
 _COMPENSATIONS: Final = get_args(Compensation)
 """In the order of enum fragprune_compensation."""
@@ -144,3 +145,68 @@ def native_threads() -> int:
 
 def _second_length(array: Tensor | None) -> int:
     return 0 if array is None else array.shape[1]
+
+
+# ---- gradients ---------------------------------------------------------------------------------
+
+_DIFFERENTIABLE = ("image", "invdepth", "alpha", "features", "surface", "fragments_per_pixel")
+_COUNTED = (
+    *("radii", "fragments", "fragments_per_gaussian"),
+    *("weights_per_gaussian", "wins_per_gaussian", "winners"),
+)
+_LEARNABLE = tuple(name for name, *_ in binding.InputGrads._fields_[1:])
+
+
+def with_gradients(
+    inputs: RasterInputs,
+    thresholds: Tensor | None,
+    draw: Callable[[Wanted], Mapping[str, Tensor | None]],
+    undraw: Callable[[Wanted, dict[str, Tensor]], dict[str, Tensor]],
+) -> dict[str, Any]:
+    """Draw in torch's graph.
+
+    Args:
+        draw: the forward pass; it gives tensors by their names in ``RasterOutputs``.
+        undraw: the backward pass, from gradients of these to gradients of inputs, by name.
+
+    Returns:
+        What ``draw`` gave, differentiable; None for what it did not give.
+    """
+    given = vars(inputs.splats) | {"hook": inputs.means2d_hook, "thresholds": thresholds}
+    given["background"] = inputs.view.background
+    tensors = {name: given[name] for name in _LEARNABLE if given.get(name) is not None}
+    drawn = _Rasterize.apply(draw, undraw, tuple(tensors), *tensors.values())  # type: ignore[no-untyped-call]
+    return dict(zip((*_DIFFERENTIABLE, *_COUNTED), drawn, strict=True))
+
+
+class _Rasterize(torch.autograd.Function):
+    """The autograd function of ``with_gradients``."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, draw: Any, undraw: Any, names: tuple[str, ...], *tensors: Tensor
+    ) -> tuple[Tensor | None, ...]:
+        needed = zip(names, ctx.needs_input_grad[3:], strict=True)
+        wanted = frozenset(name for name, needs in needed if needs)
+        drawn = draw(wanted)
+        counted = [drawn.get(name) for name in _COUNTED]
+        ctx.mark_non_differentiable(*(each for each in counted if each is not None))
+        ctx.set_materialize_grads(False)
+        ctx.undraw, ctx.names, ctx.wanted = undraw, names, wanted
+        # Saved for the sake of autograd's check against changes in place: ``undraw`` reads these.
+        ctx.save_for_backward(*tensors)
+        return (*map(drawn.get, _DIFFERENTIABLE), *counted)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
+        tensors = ctx.saved_tensors
+        by = zip(_DIFFERENTIABLE, upstream, strict=False)
+        grads = ctx.undraw(ctx.wanted, {name: grad for name, grad in by if grad is not None})
+        given: list[Tensor | None] = [None, None, None]
+        for name, tensor in zip(ctx.names, tensors, strict=True):
+            grad = grads.get(name)
+            if name == "hook" and grad is not None and tensor.shape[1] != 3:  # wider, or narrower
+                grad = torch.nn.functional.pad(grad, (0, tensor.shape[1] - 3))
+            given.append(None if grad is None else grad.to(tensor.device, tensor.dtype))
+        return tuple(given)

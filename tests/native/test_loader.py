@@ -21,9 +21,9 @@ needs_native = pytest.mark.skipif(not binding.usable_builds(), reason="no compil
 
 @pytest.fixture(autouse=True)
 def _decide_anew():
-    binding.forget()
+    binding._chosen.cache_clear()
     yield
-    binding.forget()
+    binding._chosen.cache_clear()
 
 
 def test_header_and_python_hold_the_same_constants() -> None:
@@ -52,7 +52,7 @@ def test_header_and_python_hold_the_same_structs(mirror: type[ctypes.Structure])
 def test_switched_off(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(binding.ENVIRONMENT, "off")
     assert not binding.available()
-    assert "switched off" in binding.describe()["reason"]
+    assert "switched off" in binding.chosen()
     with pytest.raises(EngineError, match="switched off"):
         create_engine("cpu")
     assert create_engine("auto").name == "reference"
@@ -71,7 +71,7 @@ def test_absent_is_remembered_with_its_reason(monkeypatch: pytest.MonkeyPatch) -
         patch.setattr(binding, "_SUFFIX", ".absent")
         patch.setattr(binding, "_path_of", counted)
         assert not binding.available()
-        assert "not installed" in binding.describe()["reason"]
+        assert "not installed" in binding.chosen()
         assert not binding.available()
     assert len(calls) == 1
 
@@ -82,7 +82,7 @@ def test_a_broken_file_is_a_reason_not_a_crash(
     broken = tmp_path / "broken.so"
     broken.write_bytes(b"not a library")
     monkeypatch.setattr(binding, "_path_of", lambda build: str(broken))
-    assert "cannot be opened" in binding.describe()["reason"]
+    assert "cannot be opened" in binding.chosen()
 
 
 @needs_native
@@ -91,29 +91,28 @@ def test_a_build_of_another_interface_is_a_reason_with_both_versions(
 ) -> None:
     ours = binding.API_VERSION
     monkeypatch.setattr(binding, "API_VERSION", ours + 1)
-    reason = binding.describe()["reason"]
+    reason = binding.chosen()
     assert f"speaks version {ours}, this package {ours + 1}; reinstall" in reason
 
 
 def test_an_unknown_build_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(binding.ENVIRONMENT, "sse9")
-    assert "not one of off, avx512, avx2, baseline" in binding.describe()["reason"]
+    assert "not one of off, avx512, avx2, baseline" in binding.chosen()
 
 
 @needs_native
 @pytest.mark.parametrize("build", binding.usable_builds())
 def test_the_environment_chooses(monkeypatch: pytest.MonkeyPatch, build: str) -> None:
     monkeypatch.setenv(binding.ENVIRONMENT, build)
-    described = binding.describe()
-    assert described["available"]
-    assert described["build"] == build
-    assert described["lanes"] == {"baseline": 4, "avx2": 8, "avx512": 16}[build]
+    opened = binding.library()
+    assert opened.build == build
+    assert opened.lanes == {"baseline": 4, "avx2": 8, "avx512": 16}[build]
 
 
 @needs_native
 def test_the_best_build_is_the_default(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(binding.ENVIRONMENT, raising=False)
-    assert binding.describe()["build"] == binding.usable_builds()[0]
+    assert binding.library().build == binding.usable_builds()[0]
     assert create_engine("auto").name == "cpu"
 
 
@@ -121,7 +120,7 @@ def test_the_best_build_is_the_default(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_processor_without_avx_gets_the_baseline(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(binding.ENVIRONMENT, raising=False)
     monkeypatch.setattr(binding, "BUILDS", {"avx512": 1 << 20, "avx2": 1 << 21, "baseline": 0})
-    assert binding.describe()["build"] == "baseline"
+    assert binding.library().build == "baseline"
 
 
 @needs_native

@@ -32,7 +32,6 @@ EXCLUDED: dict[Place, str] = {
     ("re", "_cache"): "a cache",
     ("ctypes", "_pointer_type_cache"): "a cache",
     ("_ctypes", "_pointer_type_cache"): "a cache",
-    ("fragprune_plugins.engines.cpu.binding", "_answers"): "our library, opened once",
     ("linecache", "cache"): "a cache of source lines, filled by tracebacks",
     ("torch.utils.hooks", "RemovableHandle.next_id"): "torch's counter of hooks ever made",
 }

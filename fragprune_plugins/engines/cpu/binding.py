@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import ctypes
 import os
-import threading
 import weakref
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -179,7 +179,7 @@ class Library:
     calls: ctypes.CDLL
 
 
-class Unavailable(Exception):  # noqa: N818 - a state of this machine, reported by describe()
+class Unavailable(Exception):  # noqa: N818 - a state of this machine
     """No build can be used here; the message says why."""
 
 
@@ -222,11 +222,12 @@ def open_build(build: str) -> Library:
 
 
 def cpu_features() -> int:
-    """This machine's bits of fragprune_cpu_features; 0 if no build can be asked."""
-    try:
-        return int(open_build("baseline").calls.fragprune_cpu_features())
-    except Unavailable:
-        return 0
+    """This machine's bits of fragprune_cpu_features; the baseline tells, which runs anywhere.
+
+    Raises:
+        Unavailable: that build cannot be opened.
+    """
+    return int(open_build("baseline").calls.fragprune_cpu_features())
 
 
 def _usable(features: int) -> Iterator[Library]:
@@ -239,55 +240,47 @@ def _usable(features: int) -> Iterator[Library]:
 
 def usable_builds() -> list[str]:
     """The builds that are installed and run on this machine, best first."""
-    return [each.build for each in _usable(cpu_features())]
+    with suppress(Unavailable):
+        return [each.build for each in _usable(cpu_features())]
+    return []
 
 
-def choose() -> Library:
-    """Open the best build, or the build that the environment variable names.
+def choose(wanted: str) -> Library:
+    """Open the build of this name, or the best build for "".
 
     Raises:
         Unavailable: the engine is switched off, or no build can be used.
     """
-    wanted = os.environ.get(ENVIRONMENT, "").strip().lower()
     if wanted in ("off", "0"):
         raise Unavailable(f"switched off by {ENVIRONMENT}={wanted}")
     if wanted and wanted not in BUILDS:
         names = ", ".join(["off", *BUILDS])
         raise Unavailable(f"{ENVIRONMENT}={wanted} is not one of {names}")
-    baseline = open_build("baseline")  # it alone may run anywhere, so it is the one to ask
-    features = int(baseline.calls.fragprune_cpu_features())
-    if wanted:
-        if BUILDS[wanted] & ~features:
-            raise Unavailable(f"{ENVIRONMENT}={wanted}, which this processor lacks")
-        return open_build(wanted)
-    return next(_usable(features), baseline)
+    features = cpu_features()
+    if not wanted:
+        return next(_usable(features))
+    if BUILDS[wanted] & ~features:
+        raise Unavailable(f"{ENVIRONMENT}={wanted}, which this processor lacks")
+    return open_build(wanted)
 
 
-_lock = threading.Lock()
-_answers: dict[str, Library | str] = {}
+@cache
+def _chosen(wanted: str) -> Library | str:
+    """The library, or the reason why there is none."""
+    try:
+        return choose(wanted)
+    except Unavailable as why:
+        return str(why)
 
 
-def _answer() -> Library | str:
-    """The library, or the reason why there is none; cached for each value of the environment."""
-    key = os.environ.get(ENVIRONMENT, "")
-    with _lock:
-        if key not in _answers:
-            try:
-                _answers[key] = choose()
-            except Unavailable as why:
-                _answers[key] = str(why)
-        return _answers[key]
-
-
-def forget() -> None:
-    """Forget the choice of a build, so that the next call chooses again; for tests."""
-    with _lock:
-        _answers.clear()
+def chosen() -> Library | str:
+    """The library that the environment asks for, or the reason why there is none."""
+    return _chosen(os.environ.get(ENVIRONMENT, "").strip().lower())
 
 
 def available() -> bool:
     """Whether a compiled rasterizer can be used here."""
-    return isinstance(_answer(), Library)
+    return isinstance(chosen(), Library)
 
 
 def library() -> Library:
@@ -296,7 +289,7 @@ def library() -> Library:
     Raises:
         EngineError: there is none; the message gives the reason.
     """
-    answer = _answer()
+    answer = chosen()
     if isinstance(answer, Library):
         return answer
     raise EngineError(
@@ -305,19 +298,6 @@ def library() -> Library:
         "a compiled rasterizer",
         "Reinstall where a C++17 compiler is found, or use the engine 'reference'.",
     )
-
-
-def describe() -> dict[str, Any]:
-    """What ``fragprune doctor`` prints: the build in use, or the reason why there is none."""
-    known = answer if isinstance(answer := _answer(), Library) else None
-    return {
-        "available": known is not None,
-        "build": known and known.build,
-        "lanes": known and known.lanes,
-        "path": known and known.path,
-        "usable": usable_builds() if known else [],
-        "reason": None if known else answer,
-    }
 
 
 class State:

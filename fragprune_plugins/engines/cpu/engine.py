@@ -5,12 +5,13 @@ from __future__ import annotations
 import ctypes
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
-from torch.autograd.function import once_differentiable
+from torch import Tensor
 
 from fragprune_plugins.engines.calling import (
+    Wanted,
     address,
     empty,
     expect_ok,
@@ -18,33 +19,10 @@ from fragprune_plugins.engines.calling import (
     native_inputs,
     native_threads,
     plain,
+    with_gradients,
 )
 from fragprune_plugins.engines.cpu import binding
-from fragprune_plugins.types import RasterOutputs, Splats
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from fragprune_plugins.types import RasterInputs
-
-# The differentiable inputs, in the order in which the autograd function takes them.
-_NAMES = (
-    "means",
-    "hook",
-    "opacities",
-    "scales",
-    "rotations",
-    "cov3d",
-    "sh",
-    "sh_rest",
-    "colors",
-    "features",
-    "thresholds",
-    "means2d",
-    "conics",
-    "depths",
-    "background",
-)
+from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats
 
 _STAGES = ("projection", "binning", "blend")
 
@@ -59,7 +37,6 @@ class _Drawing:
         evaluated: (Gaussian, pixel) lanes that were computed.
         entries: (Gaussian, tile) pairs that were blended.
         stages: milliseconds by stage.
-        found: the requested counts and scores, by their names in ``RasterOutputs``.
     """
 
     inputs: RasterInputs
@@ -70,79 +47,69 @@ class _Drawing:
     evaluated: int = 0
     entries: int = 0
     stages: dict[str, float] = field(default_factory=dict)
-    found: dict[str, Tensor] = field(default_factory=dict)
 
-    def draw(self, wants: dict[str, bool]) -> tuple[Tensor, ...]:
-        """Run the forward pass; returns the autograd function's outputs, in their order."""
-        view, n = self.inputs.view, len(self.inputs.splats)
-        size = (view.height, view.width)
-        fresh = partial(empty, self.workspace)
-        image, planes = fresh(3, *size), self.inputs.planes
-        invdepth, alpha = (fresh(int(name in planes), *size) for name in ("invdepth", "alpha"))
-        features = fresh(_channels(self.inputs.splats.features), *size)
-        flat = isinstance(self.inputs.splats, Splats) and self.inputs.splats.flat
-        surface = fresh(6 * (flat and "surface" in planes), *size)
-        radii, whole = fresh(n, dtype=torch.int32), torch.int32
+    def draw(self, wanted: Wanted) -> dict[str, Tensor | None]:
+        """Run the forward pass."""
+        view, splats, planes = self.inputs.view, self.inputs.splats, self.inputs.planes
+        n, size = len(splats), (view.height, view.width)
+        fresh, whole = partial(empty, self.workspace), torch.int32
+        flat = isinstance(splats, Splats) and splats.flat
+        drawn: dict[str, Tensor | None] = {
+            "image": fresh(3, *size),
+            "invdepth": fresh(int("invdepth" in planes), *size),
+            "alpha": fresh(int("alpha" in planes), *size),
+            "radii": fresh(n, dtype=whole),
+        }
+        if splats.features is not None:
+            drawn["features"] = fresh(splats.features.shape[1], *size)
+        if flat and "surface" in planes:
+            drawn["surface"] = fresh(6, *size)
         if self.inputs.counts:
-            self.found["fragments"] = fresh(*size, dtype=whole)
-            self.found["fragments_per_gaussian"] = fresh(n, dtype=whole)
+            drawn["fragments"] = fresh(*size, dtype=whole)
+            drawn["fragments_per_gaussian"] = fresh(n, dtype=whole)
         if self.inputs.scores:
-            self.found["weights_per_gaussian"] = fresh(n)
-            self.found["wins_per_gaussian"] = fresh(n, dtype=whole)
-            self.found["winners"] = fresh(*size, dtype=whole)
-        outputs = binding.Outputs(
-            image=address(image),
-            invdepth=address(invdepth),
-            alpha=address(alpha),
-            radii=address(radii),
-            features=address(features),
-            surface=address(surface),
-            **{name: address(tensor) for name, tensor in self.found.items()},
-        )
+            drawn["weights_per_gaussian"] = fresh(n)
+            drawn["wins_per_gaussian"] = fresh(n, dtype=whole)
+            drawn["winners"] = fresh(*size, dtype=whole)
+        outputs = binding.Outputs(**{name: address(each) for name, each in drawn.items()})
         given = native_inputs(
             self.inputs,
             self.arrays,
-            widen=wants["thresholds"],
+            widen="thresholds" in wanted,
             threads=native_threads(),
             workspace=self.workspace.handle,
         )
         error = binding.Error()
         handle = ctypes.c_void_p()
-        keep = any(wants.values())
         status = self.library.calls.fragprune_forward(
             ctypes.byref(given),
             ctypes.byref(outputs),
-            ctypes.byref(handle) if keep else None,
+            ctypes.byref(handle) if wanted else None,
             ctypes.byref(error),
         )
         expect_ok(status, error)
-        if keep:
+        if wanted:
             self.state = binding.State(self.library)
             self.state.handle = handle.value
         else:
             self.arrays = {}
         self.evaluated, self.entries = outputs.evaluated, outputs.entries
         self.stages = {name: getattr(outputs, f"{name}_ms") for name in _STAGES}
-        drawn = torch.tensor(outputs.drawn / (view.width * view.height), dtype=torch.float32)
-        return image, invdepth, alpha, features, surface, radii, drawn
+        per_pixel = outputs.drawn / (view.width * view.height)
+        return drawn | {"fragments_per_pixel": torch.tensor(per_pixel, dtype=torch.float32)}
 
-    def undraw(self, upstream: tuple[Tensor | None, ...], wants: dict[str, bool]) -> dict[str, Any]:
+    def undraw(self, wanted: Wanted, by: dict[str, Tensor]) -> dict[str, Tensor]:
         """Run the backward pass; returns gradients by name, float32 on the CPU."""
         assert self.state is not None
-        by = [None if g is None else plain(g) for g in upstream]
-        image, invdepth, alpha, features, surface, per_pixel = by
+        by = {name: plain(grad) for name, grad in by.items()}
+        per_pixel = by.pop("fragments_per_pixel", None)
         output_grads = binding.OutputGrads(
             fragments_per_pixel=0.0 if per_pixel is None else per_pixel.item(),
-            image=address(image),
-            invdepth=address(invdepth),
-            alpha=address(alpha),
-            features=address(features),
-            surface=address(surface),
+            **{name: address(grad) for name, grad in by.items()},
         )
-        n = len(self.inputs.splats)
         shapes = {name: array.shape for name, array in self.arrays.items()}
-        shapes["hook"] = torch.Size((n, 3))
-        grads = {k: empty(self.workspace, *shapes[k]) for k, wanted in wants.items() if wanted}
+        shapes["hook"] = torch.Size((len(self.inputs.splats), 3))
+        grads = {name: empty(self.workspace, *shapes[name]) for name in wanted}
         error = binding.Error()
         status = self.library.calls.fragprune_backward(
             self.state.handle,
@@ -153,38 +120,6 @@ class _Drawing:
         )
         expect_ok(status, error)
         return grads
-
-
-class _Rasterize(torch.autograd.Function):
-    """The autograd function of a rasterization."""
-
-    @staticmethod
-    def forward(ctx: Any, drawing: _Drawing, *tensors: Tensor | None) -> tuple[Tensor, ...]:
-        wants = dict(zip(_NAMES, ctx.needs_input_grad[1:], strict=True))
-        outputs = drawing.draw(wants)
-        ctx.mark_non_differentiable(outputs[5])
-        ctx.set_materialize_grads(False)
-        ctx.drawing, ctx.wants = drawing, wants
-        # Saved for the sake of autograd's check against changes in place: the state reads these.
-        ctx.save_for_backward(*tensors)
-        return outputs
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
-        tensors = ctx.saved_tensors
-        *pictures, _, per_pixel = upstream
-        grads = ctx.drawing.undraw((*pictures, per_pixel), ctx.wants)
-        given: list[Tensor | None] = [None]
-        for name, tensor in zip(_NAMES, tensors, strict=True):
-            if name not in grads:
-                given.append(None)
-                continue
-            grad = grads[name]
-            if name == "hook" and tensor.shape[1] != 3:
-                grad = torch.nn.functional.pad(grad, (0, tensor.shape[1] - 3))
-            given.append(grad.to(tensor.device, tensor.dtype))
-        return tuple(given)
 
 
 class CpuEngine:
@@ -208,34 +143,17 @@ class CpuEngine:
     def rasterize(self, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
         """Draw the splats; thresholds is (N,) falloff in (0, 1), or None for no truncation."""
         inputs.check_thresholds(thresholds)
-        view, splats = inputs.view, inputs.splats
-        others = {
-            "hook": inputs.means2d_hook,
-            "thresholds": thresholds,
-            "background": view.background,
-        }
-        tensors = {name: others.get(name, getattr(splats, name, None)) for name in _NAMES}
         arrays = native_arrays(inputs, thresholds)
         drawing = _Drawing(inputs, self.library, self.workspace, arrays)
-        outputs = _Rasterize.apply(  # type: ignore[no-untyped-call]
-            drawing, *(tensors[name] for name in _NAMES)
-        )
-        image, invdepth, alpha, features, surface, radii, per_pixel = outputs
-        device, pixels = splats.device, view.width * view.height
+        drawn = with_gradients(inputs, thresholds, drawing.draw, drawing.undraw)
+        there: dict[str, Any] = {
+            name: None if each is None else each.to(inputs.splats.device)
+            for name, each in drawn.items()
+        }
+        pixels = inputs.view.width * inputs.view.height
         return RasterOutputs(
-            image=image.to(device),
-            radii=radii.to(device),
-            invdepth=invdepth.to(device),
-            alpha=alpha.to(device),
-            fragments_per_pixel=per_pixel.to(device),
             evaluated_per_pixel=drawing.evaluated / pixels,
             entries_per_pixel=drawing.entries / pixels,
-            features=None if splats.features is None else features.to(device),
             stages=drawing.stages,
-            surface=surface.to(device) if len(surface) else None,
-            **{name: tensor.to(device) for name, tensor in drawing.found.items()},
+            **there,
         )
-
-
-def _channels(features: Tensor | None) -> int:
-    return 0 if features is None else features.shape[1]

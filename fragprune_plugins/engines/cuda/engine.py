@@ -3,62 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from functools import partial
 
 import torch
-from torch.autograd.function import once_differentiable
+from torch import Tensor
 
-from fragprune_plugins.engines.calling import with_joined_sh
+from fragprune_plugins.engines.calling import Wanted, with_gradients, with_joined_sh
 from fragprune_plugins.engines.cuda.driver import Driver
-from fragprune_plugins.engines.cuda.frame import (
-    Device,
-    Drawing,
-    Drawn,
-    Wanted,
-    learnable,
-)
+from fragprune_plugins.engines.cuda.frame import Device, Drawing
 from fragprune_plugins.errors import EngineError, InputError
-from fragprune_plugins.types import RasterOutputs, Splats
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from fragprune_plugins.types import RasterInputs
+from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats
 
 _FIRST_CAPACITY = 1 << 20
 """Entries of the tiles' lists that there is room for before any frame has told."""
-
-
-class _Rasterize(torch.autograd.Function):
-    """The autograd function of a rasterization."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, engine: CudaEngine, drawing: Drawing, names: tuple[str, ...], *tensors: Tensor
-    ) -> tuple[Tensor | None, ...]:
-        wanted = frozenset(
-            n for n, needs in zip(names, ctx.needs_input_grad[3:], strict=True) if needs
-        )
-        drawn = engine.draw(drawing, wanted)
-        ctx.mark_non_differentiable(*(each for each in drawn[5:] if each is not None))
-        ctx.set_materialize_grads(False)
-        ctx.drawing, ctx.names, ctx.wanted = drawing, names, wanted
-        # Saved for the sake of autograd's check against changes in place: the drawing reads these.
-        ctx.save_for_backward(*tensors)
-        return drawn
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
-        tensors = ctx.saved_tensors
-        grads = ctx.drawing.undraw(ctx.wanted, *upstream[:5])
-        given: list[Tensor | None] = [None, None, None]
-        for name, tensor in zip(ctx.names, tensors, strict=True):
-            grad = grads.get(name)
-            if name == "hook" and grad is not None:  # hooks may be wider or narrower than ours
-                grad = torch.nn.functional.pad(grad, (0, tensor.shape[1] - 3))
-            given.append(None if grad is None else grad.to(tensor.device, tensor.dtype))
-        return tuple(given)
 
 
 class CudaEngine:
@@ -109,18 +66,12 @@ class CudaEngine:
         if isinstance(inputs.splats, Splats):
             inputs = replace(inputs, splats=with_joined_sh(inputs.splats))
         drawing = Drawing(self.device, inputs, thresholds)
-        tensors = {
-            **learnable(inputs),
-            **({} if thresholds is None else {"thresholds": thresholds}),
-        }
-        drawn = _Rasterize.apply(  # type: ignore[no-untyped-call]
-            self, drawing, tuple(tensors), *tensors.values()
-        )
+        drawn = with_gradients(inputs, thresholds, partial(self.draw, drawing), drawing.undraw)
         pixels = inputs.view.width * inputs.view.height
         return RasterOutputs(
             evaluated_per_pixel=drawing.evaluated / pixels,
             entries_per_pixel=drawing.entries / pixels,
-            **Drawn(*drawn)._asdict(),
+            **drawn,
         )
 
     def expect_on_device(self, where: torch.device) -> None:
@@ -133,7 +84,7 @@ class CudaEngine:
                 "Move the Gaussians, or use the engine 'cpu'.",
             )
 
-    def draw(self, drawing: Drawing, wanted: Wanted) -> Drawn:
+    def draw(self, drawing: Drawing, wanted: Wanted) -> dict[str, Tensor | None]:
         """Run the forward pass; repeat it with more room if the lists did not fit."""
         deterministic = self._deterministic
         if deterministic is None:

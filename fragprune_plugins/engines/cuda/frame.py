@@ -8,27 +8,18 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol
 
 import torch
+from torch import Tensor
 
 from fragprune_plugins.constants import TILE
-from fragprune_plugins.engines.calling import address, native_arrays, native_inputs, plain
+from fragprune_plugins.engines.calling import Wanted, address, native_arrays, native_inputs, plain
 from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.errors import EngineError
-from fragprune_plugins.types import Splats
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from torch import Tensor
-
-    from fragprune_plugins.types import RasterInputs
-
-Wanted = frozenset[str]
-"""Inputs that gradients are wanted of, by the names of fragprune_input_grads."""
+from fragprune_plugins.types import RasterInputs
 
 # What native/cuda/frame.h says.
 THREADS: Final = 256
@@ -66,6 +57,10 @@ class Frame(ctypes.Structure):
         *binding.pointers("entry_keys entry_values owners reached transmittance"),
         *binding.pointers("stop weights"),
     )
+
+
+_PLACES: Final = frozenset(name for name, *kind in Frame._fields_ if kind == [ctypes.c_void_p])
+"""What of it is an address; an array of this name is there."""
 
 
 class Sort(ctypes.Structure):
@@ -171,9 +166,13 @@ class Arena:
 
     Args:
         sizes: bytes, by name.
+
+    Attributes:
+        filled: names of the arrays that have bytes.
     """
 
     def __init__(self, where: torch.device, fill: Callable[..., Tensor], **sizes: int) -> None:
+        self.filled = {name for name, size in sizes.items() if size}
         places, total = {}, 0
         for name, size in sizes.items():
             places[name] = total
@@ -229,19 +228,6 @@ def launch_sort(
         arguments.ticket += 4
 
 
-def learnable(inputs: RasterInputs) -> dict[str, Tensor]:
-    """The tensors of a rasterization that can have gradients, thresholds excepted."""
-    splats = inputs.splats
-    names = ["opacities", "colors", "features"]
-    if isinstance(splats, Splats):
-        names += ["means", "scales", "rotations", "cov3d", "sh"]
-    else:
-        names += ["means2d", "conics", "depths"]
-    tensors = {name: getattr(splats, name) for name in names}
-    tensors |= {"hook": inputs.means2d_hook, "background": inputs.view.background}
-    return {name: tensor for name, tensor in tensors.items() if tensor is not None}
-
-
 def refuse(entries: int, spread: float) -> None:
     """Raise EngineError if the kernels cannot draw so many entries, or such large offsets."""
     if entries > ENTRIES_MAX:
@@ -260,22 +246,6 @@ def refuse(entries: int, spread: float) -> None:
         )
 
 
-class Drawn(NamedTuple):
-    """The outputs of a forward pass, as in ``RasterOutputs``; the first five are differentiable."""
-
-    image: Tensor
-    invdepth: Tensor
-    alpha: Tensor
-    features: Tensor | None
-    fragments_per_pixel: Tensor
-    radii: Tensor
-    fragments: Tensor | None
-    fragments_per_gaussian: Tensor | None
-    weights_per_gaussian: Tensor | None
-    wins_per_gaussian: Tensor | None
-    winners: Tensor | None
-
-
 class Memory(NamedTuple):
     """The memory of one frame.
 
@@ -283,17 +253,11 @@ class Memory(NamedTuple):
         cleared: begins with zeros.
         scratch: needed until the lists are made.
         kept: what backward reads.
-        passes: of sorting, by tile.
-        keep: backward will come.
-        slots: each list entry has one, so that backward adds in a fixed order.
     """
 
     cleared: Arena
     scratch: Arena
     kept: Arena
-    passes: int
-    keep: bool
-    slots: bool
 
 
 class Drawing:
@@ -320,17 +284,23 @@ class Drawing:
         offsets = self._arrays.get("sample_offsets")
         self._spread = None if offsets is None else offsets.abs().amax()
         self._across, self._down = -(-view.width // TILE), -(-view.height // TILE)
+        self._passes = max(1, blocks_of((self._across * self._down - 1).bit_length(), 8))
         self._channels = 0 if inputs.splats.features is None else inputs.splats.features.shape[1]
         self._frame: Frame | None = None
 
     # ---- forward -------------------------------------------------------------------------------
 
-    def draw(self, capacity: int, wanted: Wanted, *, deterministic: bool) -> Drawn:
+    def draw(
+        self, capacity: int, wanted: Wanted, *, deterministic: bool
+    ) -> dict[str, Tensor | None]:
         """Launch the forward pass. Its result is invalid if entries exceed the capacity.
 
         Args:
             capacity: the number of list entries, over all tiles, to allocate room for.
             deterministic: give each entry its own slot, so that backward can add in order.
+
+        Returns:
+            Tensors by their names in ``RasterOutputs``.
         """
         inputs, n, where = self._inputs, self._n, self.where
         tiles, pixels = self._across * self._down, inputs.view.width * inputs.view.height
@@ -338,10 +308,18 @@ class Drawing:
         memory = self._room(capacity, keep, keep and deterministic)
         outputs = self._new_outputs()
         weights = torch.zeros(n, dtype=torch.int64, device=where) if inputs.scores else None
-        frame = self._new_frame(capacity, memory)
-        frame.inputs = native_inputs(inputs, self._arrays, widen="thresholds" in wanted)
-        frame.outputs = binding.Outputs(**{name: address(each) for name, each in outputs.items()})
-        frame.weights = address(weights)
+        places = {k: arena[k] for arena in memory for k in arena.filled & _PLACES}
+        frame = Frame(
+            inputs=native_inputs(inputs, self._arrays, widen="thresholds" in wanted),
+            outputs=binding.Outputs(**{name: address(each) for name, each in outputs.items()}),
+            spread=address(self._spread),
+            capacity=capacity,
+            tiles_x=self._across,
+            tiles_y=self._down,
+            tile_passes=self._passes,
+            weights=address(weights),
+            **places,
+        )
         self._list(frame, memory)
         macros = blend_macros(
             self._channels,
@@ -356,18 +334,20 @@ class Drawing:
             self._frame = frame
         self._memory = (memory.cleared, memory.kept)
         self._found = found
-        return Drawn(
-            fragments_per_pixel=(found[2].double() / pixels).float(),
-            weights_per_gaussian=None if weights is None else (weights.double() * 2.0**-32).float(),
-            **outputs,
-        )
+        per_pixel = (found[2].double() / pixels).float()
+        weighed = None if weights is None else (weights.double() * 2.0**-32).float()
+        return outputs | {"fragments_per_pixel": per_pixel, "weights_per_gaussian": weighed}
 
     def _room(self, capacity: int, keep: bool, slots: bool) -> Memory:
-        """The memory of a frame."""
+        """The memory of a frame.
+
+        Args:
+            keep: backward will come.
+            slots: each list entry has one, so that backward adds in a fixed order.
+        """
         n, where = self._n, self.where
         tiles = self._across * self._down
         pixels = self._inputs.view.width * self._inputs.view.height
-        passes = max(1, blocks_of((tiles - 1).bit_length(), 8))
         cleared = Arena(
             where,
             torch.zeros,
@@ -377,7 +357,7 @@ class Drawing:
             depth_histogram=4 * PASSES * DIGITS,
             tile_histogram=4 * PASSES * DIGITS,
             depth_sort=4 * PASSES * DIGITS * blocks_of(n, SORT_KEYS),
-            tile_sort=4 * passes * DIGITS * blocks_of(capacity, SORT_KEYS),
+            tile_sort=4 * self._passes * DIGITS * blocks_of(capacity, SORT_KEYS),
             ranges=8 * tiles,
         )
         scratch = Arena(
@@ -399,40 +379,12 @@ class Drawing:
             transmittance=4 * pixels * keep,
             stop=4 * pixels * keep,
         )
-        return Memory(cleared, scratch, kept, passes, keep, slots)
-
-    def _new_frame(self, capacity: int, memory: Memory) -> Frame:
-        """The kernels' arguments that are places in the memory of a frame."""
-        cleared, scratch, kept = memory.cleared, memory.scratch, memory.kept
-        keep, slots = memory.keep, memory.slots
-        return Frame(
-            spread=address(self._spread),
-            capacity=capacity,
-            tiles_x=self._across,
-            tiles_y=self._down,
-            tile_passes=memory.passes,
-            counters=cleared["counters"],
-            project_words=cleared["project_words"],
-            emit_words=cleared["emit_words"],
-            depth_histogram=cleared["depth_histogram"],
-            tile_histogram=cleared["tile_histogram"],
-            ranges=cleared["ranges"],
-            brushes=kept["brushes"],
-            rects=scratch["rects"],
-            tiles=kept["tiles"],
-            first_slot=kept["first_slot"] if slots else None,
-            depth_keys=scratch["depth_keys"],
-            depth_ids=scratch["depth_ids"],
-            owners=kept["owners"] if slots else None,
-            reached=kept["reached"] if keep else None,
-            transmittance=kept["transmittance"] if keep else None,
-            stop=kept["stop"] if keep else None,
-        )
+        return Memory(cleared, scratch, kept)
 
     def _list(self, frame: Frame, memory: Memory) -> None:
         """Project the Gaussians, and list them by tile and depth."""
-        n, capacity, passes = self._n, frame.capacity, memory.passes
-        cleared, scratch, kept = memory.cleared, memory.scratch, memory.kept
+        n, capacity, passes = self._n, frame.capacity, self._passes
+        cleared, scratch, kept = memory
         keys = [scratch["entry_keys"], scratch["entry_keys_2"]]
         values = [kept["entry_values"], scratch["entry_values_2"]]
         if passes % 2:  # the last sorting pass of the entries must end in `kept`
@@ -474,8 +426,8 @@ class Drawing:
         refuse(entries, 0.0 if self._spread is None else float(self._spread))
         return entries
 
-    def _new_outputs(self) -> dict[str, Any]:
-        """The tensors that the kernels fill, by their names in ``Drawn``; None if unwanted."""
+    def _new_outputs(self) -> dict[str, Tensor | None]:
+        """The tensors that the kernels fill, by name; None if unwanted."""
         inputs, n = self._inputs, self._n
         size = (inputs.view.height, inputs.view.width)
         new = partial(torch.empty, device=self.where)
@@ -495,26 +447,11 @@ class Drawing:
 
     # ---- backward ------------------------------------------------------------------------------
 
-    def undraw(
-        self,
-        wanted: Wanted,
-        by_image: Tensor | None,
-        by_invdepth: Tensor | None,
-        by_alpha: Tensor | None,
-        by_features: Tensor | None,
-        by_fragments: Tensor | None,
-    ) -> dict[str, Tensor]:
+    def undraw(self, wanted: Wanted, by: dict[str, Tensor]) -> dict[str, Tensor]:
         """Run the backward pass: from the outputs' gradients to the inputs', by name."""
         assert self._frame is not None
         inputs, frame, n, where = self._inputs, self._frame, self._n, self.where
-        upstream = {
-            "image": by_image,
-            "invdepth": by_invdepth,
-            "alpha": by_alpha,
-            "features": by_features,
-            "fragments": by_fragments,
-        }
-        by = {k: plain(g, where) for k, g in upstream.items() if g is not None}
+        by = {name: plain(grad, where) for name, grad in by.items()}
         macros = unblend_macros(
             wanted,
             sh_turns="sh" in self._arrays and frame.inputs.sh_degree > 0,
@@ -541,7 +478,7 @@ class Drawing:
                 **{k: address(by.get(k)) for k in ("image", "invdepth", "alpha", "features")}
             ),
             to=binding.InputGrads(**{name: address(grad) for name, grad in grads.items()}),
-            by_fragments=address(by.get("fragments")),
+            by_fragments=address(by.get("fragments_per_pixel")),
             background=address(by_tile),
             sums=address(room),
             ceiling=math.inf if inputs.cap_gradient else inputs.alpha_max,

@@ -42,7 +42,7 @@ typedef long long int64_t; typedef unsigned long long uint64_t;
 """
 
 
-class Unavailable(Exception):  # noqa: N818 - a state of this machine, reported by describe()
+class Unavailable(Exception):  # noqa: N818 - a state of this machine
     """Kernels cannot be compiled here; the message gives the reason."""
 
 

@@ -20,13 +20,13 @@ def describe_machine(device: torch.device | str = "cpu") -> dict[str, Any]:
         the device, None for the CPU).
     """
     device = torch.device(device)
-    native = binding.describe()
+    native = binding.chosen()
     return {
         "processor": _processor(),
         "cores": os.cpu_count(),
         "platform": platform.platform(),
         "torch": torch.__version__,
-        "native": str(native["build"]) if native["available"] else None,
+        "native": native.build if isinstance(native, binding.Library) else None,
         "gpu": torch.cuda.get_device_name(device) if device.type == "cuda" else None,
     }
 

@@ -24,7 +24,7 @@ _AGREES = {"agrees": True, "fails": False, "could not run": None}
 def examine() -> Report:
     """What is installed, and what is wrong with it."""
     packages = {name: _version(name) for name in _PACKAGES}
-    native = binding.describe()
+    native = _cpu_engine()
     # This comes first, because a GPU may allow only one process.
     verdict = self_check.check_in_subprocess("cuda") if driver.missing() is None else None
     gpu = _cuda_engine()
@@ -124,6 +124,20 @@ def _version(package: str) -> str | None:
         return version(package)
     except PackageNotFoundError:
         return None
+
+
+def _cpu_engine() -> dict[str, Any]:
+    """The build in use, or the reason why there is none."""
+    answer = binding.chosen()
+    known = answer if isinstance(answer, binding.Library) else None
+    return {
+        "available": known is not None,
+        "build": known and known.build,
+        "lanes": known and known.lanes,
+        "path": known and known.path,
+        "usable": binding.usable_builds() if known else [],
+        "reason": None if known else answer,
+    }
 
 
 def _cuda_engine() -> dict[str, Any]:
