@@ -99,20 +99,11 @@ def run(
             "Read the host's own message above.",
         )
     return RunSummary(
-        adapter=name,
-        engine=learned.engine,
+        **vars(learned) | {"adapter": name},
         device=device,
         stage=options.stage,
-        iterations=learned.steps,
-        gaussians=learned.gaussians,
-        fragments_before=learned.fragments_before,
-        fragments_after=learned.fragments_after,
-        model_before=None,
-        model_after=None,
         train_seconds=time.perf_counter() - started,
-        target_reached=learned.target_reached,
         curves=recorder.curves,
-        settings=learned.settings,
         output=output,
         not_compared=NotComparedError(
             name,

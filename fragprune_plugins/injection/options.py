@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from fragprune_plugins.errors import NotComparedError
 from fragprune_plugins.hosts.photographs import Photographs
+from fragprune_plugins.learning.events import Summary
 from fragprune_plugins.learning.schedule import Settings
 
 Stage = Literal["auto", "finetune", "joint", "off"]
@@ -44,27 +45,18 @@ class RunOptions:
     trust: bool = False
 
 
-@dataclass(frozen=True)
-class RunSummary:
-    """The result of a run.
+@dataclass(frozen=True, kw_only=True)
+class RunSummary(Summary):
+    """The result of a run; without a step where nothing learned.
 
     Attributes:
-        adapter: the adapter's name.
-        engine: name of the engine that drew stage 2; "" if none drew.
         device: "cpu", "cuda" or "cuda:N".
         stage: the stage of ``RunOptions``.
-        iterations: number of learned iterations.
-        gaussians: number of Gaussians in the trained model.
-        fragments_before: fragments per pixel over training views, untruncated.
-        fragments_after: fragments per pixel over training views, at each view's last visit.
         model_before: the host's PLY of stage 1, if there is one.
         model_after: the host's PLY after stage 2; its sidecar lies beside it.
         train_seconds: wall time of both stages.
-        target_reached: whether training views met a target speed-up within 5%; None without a
-            target.
         curves: one dict per learned step: step, loss, fragments_per_pixel, pressure,
             threshold_median.
-        settings: settings of the fine-tuning.
         output: the host's output folder; stage 1's, if stage 2 has its own.
         photographs: the data set whose held-out views can measure the models; None if they cannot
             be measured.
@@ -73,20 +65,12 @@ class RunSummary:
         already_finished: ``model_after`` was there before, and nothing was run.
     """
 
-    adapter: str
-    engine: str
     device: str
     stage: str
-    iterations: int
-    gaussians: int
-    fragments_before: float | None
-    fragments_after: float | None
-    model_before: Path | None
-    model_after: Path | None
+    model_before: Path | None = None
+    model_after: Path | None = None
     train_seconds: float
-    target_reached: bool | None
     curves: list[dict[str, float]]
-    settings: dict[str, Any]
     output: Path | None = None
     photographs: Photographs | None = None
     drawing: dict[str, Any] = field(default_factory=dict)

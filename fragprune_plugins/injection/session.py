@@ -152,16 +152,12 @@ class Session(SessionState):
         stage = state.stage if state else None
         if stage is not None and stage.taken == stage.steps:
             stage.close()
-        done = stage.progress() if stage else None
+        done = vars(stage.progress()) if stage else {}
         summary = Summary(
             adapter=self.adapter.name,
             engine=", ".join(dict.fromkeys(engine.name for engine in self.engines.values())),
-            steps=done.steps if done else 0,
-            gaussians=len(state.store) if state else 0,
-            fragments_before=done.fragments_before if done else None,
-            fragments_after=done.fragments_after if done else None,
-            target_reached=done.target_reached if done else None,
             settings=self.settings.as_dict(),
+            **done | {"gaussians": len(state.store) if state else 0},
         )
         self.plugins.tell(hookspecs.fragprune_finished, summary=summary)
         return summary

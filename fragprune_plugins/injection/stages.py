@@ -264,23 +264,17 @@ class Stages:
 
     def summary(self, seconds: float) -> RunSummary:
         """The summary, after all stages have ended."""
-        learned = self.learned
+        settings: dict[str, Any] = {"settings": self.options.settings.as_dict()}
+        learned = vars(self.learned) if self.learned else {"adapter": self.adapter.name}
         photographs, drawing, not_compared = self._comparison()
         return RunSummary(
-            adapter=self.adapter.name,
-            engine=learned.engine if learned else "",
+            **learned | settings,
             device=self.device,
             stage=self.options.stage,
-            iterations=learned.steps if learned else 0,
-            gaussians=learned.gaussians if learned else 0,
-            fragments_before=learned.fragments_before if learned else None,
-            fragments_after=learned.fragments_after if learned else None,
             model_before=self.before,
             model_after=self.after,
             train_seconds=seconds,
-            target_reached=learned.target_reached if learned else None,
             curves=self.curves,
-            settings=self.options.settings.as_dict(),
             output=self.around or self.output,
             photographs=photographs,
             drawing=drawing,

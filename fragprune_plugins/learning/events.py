@@ -39,23 +39,42 @@ class StepStats:
     loss: float = math.nan
 
 
-@dataclass(frozen=True)
-class Summary:
-    """Result of a session on the training views that it drew.
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """State of a stage 2, on the training views that it drew.
 
     Attributes:
-        steps: number of steps that learned.
-        gaussians: in the trained model.
-        fragments_before: per pixel, untruncated with the opacities at each view's first visit.
-        fragments_after: per pixel, as drawn at each view's last visit.
-        target_reached: within 5% of the target speed-up; None without one.
+        steps: that learned: the driver's optimizer took them.
+        gaussians: N.
+        fragments_before: per pixel, mean over views: untruncated, with the opacities at each view's
+            first visit; None where no view was drawn.
+        fragments_after: likewise, as drawn at each view's last visit.
+        speedup: before over after; where a target was met, as measured when it was met.
+        faster: frame times before over after, as measured when a target time was met; else None.
+        target_reached: the ratio is within 5 % of the target; None without a target.
+        pressure: lambda.
+    """
+
+    steps: int = 0
+    gaussians: int = 0
+    fragments_before: float | None = None
+    fragments_after: float | None = None
+    speedup: float | None = None
+    faster: float | None = None
+    target_reached: bool | None = None
+    pressure: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Summary(Progress):
+    """Result of a session.
+
+    Attributes:
+        adapter: the adapter's name.
+        engine: name of the engine that drew stage 2; "" if none drew.
+        settings: settings of the fine-tuning.
     """
 
     adapter: str
-    engine: str
-    steps: int
-    gaussians: int
-    fragments_before: float | None
-    fragments_after: float | None
-    target_reached: bool | None
+    engine: str = ""
     settings: dict[str, Any]

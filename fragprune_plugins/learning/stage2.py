@@ -22,7 +22,6 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, TypeVar
 
@@ -30,7 +29,7 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.errors import DivergedError, ResetError
-from fragprune_plugins.learning.events import StepStats
+from fragprune_plugins.learning.events import Progress, StepStats
 from fragprune_plugins.learning.finite import are_finite, expect_finite, not_finite
 from fragprune_plugins.learning.plain import numbers_of, put
 from fragprune_plugins.learning.pressure import Observation, StepViews
@@ -76,31 +75,6 @@ def learned_thresholds(inputs: RasterInputs, store: ThresholdStore) -> Tensor | 
 def evenly(views: Sequence[View], most: int) -> Sequence[View]:
     """Views at even distances, so many at most, from the first on."""
     return views[:: max(1, -(-len(views) // most))]
-
-
-@dataclass(frozen=True)
-class Progress:
-    """State of a stage 2.
-
-    Attributes:
-        steps: that the driver's optimizer took.
-        gaussians: N.
-        fragments_before: per pixel, mean over views; None where no view was drawn.
-        fragments_after: likewise.
-        speedup: before over after; where a target was met, as measured when it was met.
-        faster: frame times before over after, as measured when a target time was met; else None.
-        target_reached: the ratio is within 5 % of the target; None without a target.
-        pressure: lambda.
-    """
-
-    steps: int
-    gaussians: int
-    fragments_before: float | None
-    fragments_after: float | None
-    speedup: float | None
-    faster: float | None
-    target_reached: bool | None
-    pressure: float
 
 
 class Stage2:

@@ -75,7 +75,7 @@ def test_stage_2_goes_on_from_the_fine_phase_and_repeats_no_coarse_one(
     summary = run(words, options)
     before, after = summary.model_before, summary.model_after
     assert (before.parent.name, after.parent.name) == ("iteration_20", "iteration_29")
-    assert summary.iterations == 8
+    assert summary.steps == 8
     assert summary.fragments_after < summary.fragments_before
     frozen = options is OPTIONS
     assert (runs.frozen_differences(before, after) == []) == frozen
@@ -95,7 +95,7 @@ def test_one_run_learns_after_an_iteration_of_the_fine_phase_alone(mini, photogr
         command(mini, photographs, tmp_path / "out", *more),
         replace(OPTIONS, stage="finetune", from_iter=9),
     )
-    assert summary.iterations == LAST - 9 - 1
+    assert summary.steps == LAST - 9 - 1
     assert "network" in summary.not_compared.found  # whatever else is missing
     files = ("coarse_9", "coarse_14", "fine_9", "fine_16", f"fine_{LAST}")
     nine, fourteen, fine, early, late = (
@@ -120,7 +120,7 @@ def test_joint_learning_counts_fine_iterations_and_follows_rows(mini, photograph
     options = replace(OPTIONS, stage="joint", from_iter=3)
     summary = run(command(mini, photographs, tmp_path / "out"), options)
     store, _ = sidecar.load(summary.model_after)
-    assert summary.iterations == LAST - 1
+    assert summary.steps == LAST - 1
     assert store.steps == LAST - 1 - 3
     assert len(store) == summary.gaussians != 150
 
@@ -263,7 +263,7 @@ def test_the_file_wins_and_stage_2_still_ends_where_it_should(
     text = config.read_text()
     words = command(mini, photographs, tmp_path / "out", "--configs", config, iterations=1000)
     summary = run(words, OPTIONS)
-    assert summary.iterations == 8
+    assert summary.steps == 8
     assert summary.model_after.parent.name == f"iteration_{LAST + 9}"
     assert load(tmp_path / "out" / f"chkpnt_fine_{LAST}.pth")[1] == LAST
     assert network(summary.model_after)["grid_planes"].shape == (4, 4)

@@ -154,7 +154,7 @@ def test_pruning_is_stage_one_of_its_own_script(mini, photographs, trained, tmp_
         shutil.copy(out / "chkpnt29.pth", tmp_path)  # of another run, and later
     again = run(words, OPTIONS)
     assert again.gaussians < 0.75 * summary.gaussians
-    assert again.iterations == 8
+    assert again.steps == 8
     names = [path.parent.name for path in (again.model_before, again.model_after)]
     assert names == [f"iteration_{at + 6}", f"iteration_{at + 15}"]
     assert frozen_differences(again.model_before, again.model_after) == []
@@ -186,7 +186,7 @@ def test_finetune_alone_resumes_the_checkpoint_that_pruning_was_given(
     words = command(mini, "prune_finetune.py", photographs, tmp_path, 40, "--sh_degree", 2)
     words += ["--prune_iterations", "30", "--start_checkpoint", str(out / "chkpnt29.pth")]
     again = run(words, RunOptions(device="cpu", stage="finetune", settings=OPTIONS.settings))
-    assert (again.gaussians, again.iterations) == (summary.gaussians, 8)
+    assert (again.gaussians, again.steps) == (summary.gaussians, 8)
     assert frozen_differences(summary.model_after, again.model_after) == []
 
 
@@ -207,7 +207,7 @@ def test_distillation_is_resumed_by_the_training_script(mini, photographs, train
     degree_two(trained[1])
     words = distilling(mini, photographs, tmp_path, trained, 33, "--augmented_view")
     summary = run(words, OPTIONS)
-    assert summary.iterations == 8
+    assert summary.steps == 8
     assert [read_ply(p).sh_degree for p in (summary.model_before, summary.model_after)] == [1, 1]
     assert summary.model_after.parent.name == "iteration_42"
     assert frozen_differences(summary.model_before, summary.model_after) == []

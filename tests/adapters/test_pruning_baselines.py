@@ -140,7 +140,7 @@ def test_compact_learns_in_the_later_part_of_its_run(compact, photographs, tmp_p
     options = replace(OPTIONS, stage="finetune", from_iter=10)
     summary = run(command(compact, photographs, tmp_path, 16), options)
     store, info = sidecar.load(summary.model_after)
-    assert (info.adapter, summary.iterations) == ("compact-3dgs", 5)
+    assert (info.adapter, summary.steps) == ("compact-3dgs", 5)
     assert len(store) == info.rows == len(PlyData.read(summary.model_after)["vertex"].data)
     assert not store.neutral
     assert summary.fragments_after < summary.fragments_before

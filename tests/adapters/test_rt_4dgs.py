@@ -229,7 +229,7 @@ def test_train_then_finetune_moves_no_frozen_bit_and_counts_every_step(mini, con
     file = config(rot=rot)
     text = file.read_text()
     summary = run(command(mini, file), RunOptions(**OPTIONS))
-    assert (summary.adapter, summary.iterations) == ("rt-4dgs", 5)
+    assert (summary.adapter, summary.steps) == ("rt-4dgs", 5)
     assert summary.model_before == tmp_path / "out" / "chkpnt10.pth"
     assert summary.model_after == tmp_path / "out" / "chkpnt17.pth"
     (before, first), (after, last) = map(load, (summary.model_before, summary.model_after))

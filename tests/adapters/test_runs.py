@@ -210,7 +210,7 @@ def test_ctrl_c_keeps_a_portable_model_though_it_has_no_thresholds(photographs, 
 def test_a_finished_ply_without_a_checkpoint_is_enough(photographs, trained):
     before = {p for p in trained.rglob("*") if p.is_file()}
     summary = run(command(photographs, trained, 10), replace(OPTIONS, stage="finetune"))
-    assert summary.iterations == 8
+    assert summary.steps == 8
     old, new = read_ply(summary.model_before), read_ply(summary.model_after)
     assert torch.equal(old.xyz, new.xyz)
     made = {p.name for p in trained.rglob("*") if p.is_file()} - {p.name for p in before}
@@ -268,7 +268,7 @@ def test_learning_from_an_iteration_on_freezes_from_there(photographs, tmp_path)
     assert torch.equal(capture[1].detach(), final.xyz)
     assert torch.equal(capture[4].detach(), final.scaling)
     assert len(final.xyz) != 150
-    assert summary.iterations == 7  # of 13 to 20: hosts take no step in the last
+    assert summary.steps == 7  # of 13 to 20: hosts take no step in the last
 
 
 @pytest.fixture(scope="module")

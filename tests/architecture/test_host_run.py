@@ -16,7 +16,7 @@ words = ["--iterations", "4", "--save_iterations", "4", "--test_iterations", "-1
 command = [host + "/train.py", "-s", scene, "-m", out, *words]
 summary = run(command, RunOptions(device="cpu", settings=Settings(iterations=4)))
 ours = [name for name in sys.modules if name.startswith("fragprune_plugins.workbench")]
-print(json.dumps([ours, sorted(sys.modules), summary.iterations]))
+print(json.dumps([ours, sorted(sys.modules), summary.steps]))
 """
 
 

@@ -33,7 +33,9 @@ if "stops" not in rest:
         stats = StepStats(step + 1, 9.0, 1e-3, 0.1)
         installed().tell(hookspecs.fragprune_step, stats=stats)
     settings = {"goal": "control" if "control" in rest else "pressure"}
-    summary = Summary("studio", "cpu", int(iterations), 7, 9.0, 3.0, None, settings)
+    learned = {"gaussians": 7, "fragments_before": 9.0, "fragments_after": 3.0}
+    made = {"adapter": "studio", "engine": "cpu", "steps": int(iterations), "settings": settings}
+    summary = Summary(**made, **learned)
     installed().tell(hookspecs.fragprune_finished, summary=summary)
 """
 
@@ -90,7 +92,7 @@ def ran(*words, **options):
 def test_the_method_runs_in_place_of_the_named_one_and_its_summary_is_the_runs():
     summary = ran()
     assert (summary.adapter, summary.engine, summary.device) == ("studio", "cpu", "cpu")
-    assert (summary.iterations, summary.gaussians) == (3, 7)
+    assert (summary.steps, summary.gaussians) == (3, 7)
     assert (summary.fragments_before, summary.fragments_after) == (9.0, 3.0)
     assert [curve["step"] for curve in summary.curves] == [1, 2, 3]
     assert "own evaluation" in summary.not_compared.remedy

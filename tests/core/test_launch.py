@@ -173,7 +173,7 @@ def test_the_script_sees_a_fresh_interpreter_and_leaves_ours_as_it_was(host, tmp
     assert (argv, first) == ([script, str(tmp_path / "notes")], str(Path(script).parent))
     assert (name, file) == ("__main__", script)
     assert "neighbour" not in sys.modules
-    assert (summary.stage, summary.iterations, summary.device) == ("off", 0, "cpu")
+    assert (summary.stage, summary.steps, summary.device) == ("off", 0, "cpu")
 
 
 def test_modules_of_an_environment_inside_the_host_are_not_forgotten(host, tmp_path):

@@ -66,7 +66,7 @@ def learned(words: Sequence[str], stage: str, checkpoint: int = 0) -> Learned:
     return Learned(
         moved=[name for name in before if not torch.equal(before[name], after[name])],
         rows=(len(before["xyz"]), len(after["xyz"]), thresholds["rows"]),
-        steps=(summary.iterations, thresholds["steps"]),
+        steps=(summary.steps, thresholds["steps"]),
         fragments=(summary.fragments_before, summary.fragments_after),
         models=files,
     )

@@ -118,4 +118,4 @@ def test_a_script_of_ones_own_runs_with_the_package_answered(tmp_path):
         "assert 'Stand-in' in GaussianRasterizer.__doc__\n"
     )
     summary = run(["python", str(script)], RunOptions(device="cpu"))
-    assert (summary.adapter, summary.iterations) == ("gaussian-splatting", 0)
+    assert (summary.adapter, summary.steps) == ("gaussian-splatting", 0)

@@ -56,7 +56,7 @@ def evaluated(folder, iteration):
 def test_stage_two_follows_the_training_in_one_longer_run(release, train, tmp_path, strategy):
     out = tmp_path / "out"
     summary = train("--save-steps", 3, strategy=strategy)
-    assert (summary.iterations, len(summary.curves)) == (MORE, MORE)
+    assert (summary.steps, len(summary.curves)) == (MORE, MORE)
     first, last = checkpoint(out, TOTAL), checkpoint(out, TOTAL + MORE)
     assert (summary.model_before, summary.model_after) == (first, last)
     assert {path.name for path in out.glob("ckpts/*.pt")} == {
@@ -80,7 +80,7 @@ def test_an_evaluation_draws_with_the_thresholds_beside_its_checkpoint(release, 
         if not truncated:
             sidecar.path_beside(last).unlink()
         (out / "stats" / f"val_step{TOTAL + MORE - 1:04d}.json").unlink()
-        assert train("--ckpt", last).iterations == 0
+        assert train("--ckpt", last).steps == 0
         seen.append(evaluated(out, TOTAL + MORE)["mean"])
     assert seen[0] < seen[1]  # what is truncated is missing on black
 
@@ -105,7 +105,7 @@ def test_joint_learning_begins_where_refinement_ends(train, tmp_path):
         train(stage="joint")
     summary = train(stage="joint", from_iter=4)
     store, _ = sidecar.load(summary.model_after, summary.gaussians)
-    assert (summary.iterations, len(store)) == (TOTAL, summary.gaussians)
+    assert (summary.steps, len(store)) == (TOTAL, summary.gaussians)
 
 
 @pytest.mark.parametrize(

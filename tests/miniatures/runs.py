@@ -79,7 +79,7 @@ def check_stage_two(
 ) -> None:
     """Of a finished run with ``OPTIONS``: opacities moved alone, each row has its threshold."""
     before, after = summary.model_before, summary.model_after
-    assert (summary.adapter, summary.iterations) == (adapter, iterations)
+    assert (summary.adapter, summary.steps) == (adapter, iterations)
     assert frozen_differences(before, after, read) == []
     assert not torch.equal(read(before).opacity, read(after).opacity)
     store, info = sidecar.load(after)

@@ -179,7 +179,7 @@ def _measure(
         "control_psnr_change": zero["psnr"] - before["psnr"],
         "ssim_change": after["ssim"] - before["ssim"],
         "gaussians": after["gaussians"],
-        "iterations": summary.iterations,
+        "iterations": summary.steps,
         "train_seconds": summary.train_seconds,
         "adapter": summary.adapter,
         "engine": after["engine"],

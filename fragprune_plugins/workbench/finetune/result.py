@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.learning.events import StepStats
+from fragprune_plugins.learning.events import Progress, StepStats
 from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.learning.stage2 import Progress
 from fragprune_plugins.types import one_line
 
 

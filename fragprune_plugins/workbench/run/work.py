@@ -80,7 +80,7 @@ def run(
             except FragpruneError as error:  # the trained model is saved already
                 not_compared = error
     data = _figures(summary, settings, before, after, not_compared)
-    if summary.iterations and summary.model_after:
+    if summary.steps and summary.model_after:
         more = {"curves": summary.curves, "photographs": photographs}
         records.leave(summary.model_after, "run", data | more)
     return Report(data, _describe(summary, data, not_compared))
@@ -99,7 +99,7 @@ def _figures(
         "engine": summary.engine,
         "device": summary.device,
         "stage": summary.stage,
-        "iterations": summary.iterations,
+        "iterations": summary.steps,
         "gaussians": summary.gaussians,
         "training_views": {
             "fragments_per_pixel_before": summary.fragments_before,
@@ -171,7 +171,7 @@ def _describe(
             f"nothing was run. --again learns again.\n"
             f"Compare: fragprune compare {summary.model_before} {summary.model_after}"
         )
-    if not summary.iterations:
+    if not summary.steps:
         return f"{summary.adapter}: the host ended; nothing was learned (--stage {summary.stage})."
     lines = []
     if data["before"]:
@@ -196,7 +196,7 @@ def _describe(
     learned = "of the control" if control else _WHERE.get(summary.stage, "of stage 2")
     lines.append(
         f"{summary.adapter}, {summary.engine or 'host'} engine on {summary.device}: "
-        f"{summary.iterations} iterations {learned}{pressure}, "
+        f"{summary.steps} iterations {learned}{pressure}, "
         f"{summary.train_seconds:.0f} s in all. "
         f"Model: {summary.model_after or _saved(summary)}."
     )
