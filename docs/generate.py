@@ -77,8 +77,10 @@ def adapters() -> str:
 {" ".join(rest)}"""
     kinds = [
         kind
-        for module in (adapting, fragprune_graphdeco)
-        for kind in (getattr(module, name) for name in module.__all__)
+        for kind in (
+            *vars(adapting).values(),
+            *(getattr(fragprune_graphdeco, name) for name in fragprune_graphdeco.__all__),
+        )
         if inspect.isclass(kind)
         and kind.__module__.startswith(("fragprune_plugins.hosts", "fragprune_graphdeco"))
         and not kind.__module__.endswith(".seams")

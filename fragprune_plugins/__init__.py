@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from fragprune_plugins.workbench.scenes.dataset import load_dataset
     from fragprune_plugins.workbench.scenes.generated import views_near
     from fragprune_plugins.workbench.scenes.itself import own_pictures, with_own_pictures
+    from fragprune_plugins.workbench.scenes.pinhole import look_at
 
 __version__ = VERSION
 
@@ -65,6 +66,7 @@ _NAMES = {
     "workbench.scenes.dataset": "load_dataset",
     "workbench.scenes.generated": "views_near",
     "workbench.scenes.itself": "own_pictures with_own_pictures",
+    "workbench.scenes.pinhole": "look_at",
 }
 """By module, the names that it gives this package."""
 
@@ -100,6 +102,7 @@ __all__ = [
     "load",
     "load_cameras",
     "load_dataset",
+    "look_at",
     "measure",
     "overview",
     "own_pictures",

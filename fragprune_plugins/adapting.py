@@ -13,6 +13,7 @@ settings    parse_goal
 a plugin    hookimpl
 errors      each with where, found, expected and remedy
 
+Every name here is imported as itself: that is how Python says that a module passes it on.
 Importing this module imports no torch. Model, read_ply and thresholds_of load it when they are
 first used: import them inside functions, or under TYPE_CHECKING.
 
@@ -24,116 +25,64 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from fragprune_plugins.constants import ALPHA_MIN, NEAR, TRANSMITTANCE_MIN
-from fragprune_plugins.errors import (
-    AlignmentError,
-    EngineError,
-    InputError,
-    Interrupted,
-    ModelFileError,
-    NotComparedError,
-    SessionError,
-    Terminated,
-    UsageError,
-)
-from fragprune_plugins.files.atomic import replacing
-from fragprune_plugins.files.columns import change_of
-from fragprune_plugins.files.reading import Door
-from fragprune_plugins.hosts.adapter import (
-    CHECKPOINT_KEY,
-    GROUPS,
-    CommandLine,
-    ConfigFile,
-    HostAdapter,
-    HostInfo,
-    ParamGroup,
-    ScriptAdapter,
-)
-from fragprune_plugins.hosts.dialect import Dialect, HostCall, Place, Proof, Prover
-from fragprune_plugins.hosts.findings import Finding, Plain
-from fragprune_plugins.hosts.photographs import WIDEST, Photographs, Resolution
-from fragprune_plugins.hosts.seams import Role, RowTrace, Seam, SeamCall, revised
-from fragprune_plugins.hosts.source import (
-    Function,
-    HostRepo,
-    imported,
-    is_off,
-    nodes,
-    off_by_default,
-)
-from fragprune_plugins.learning.goals import parse_goal
-from fragprune_plugins.plugins.hookspecs import hookimpl
-from fragprune_plugins.types import (
-    Footprints,
-    RasterInputs,
-    RasterOutputs,
-    Splats,
-    View,
-)
+from fragprune_plugins.constants import ALPHA_MIN as ALPHA_MIN
+from fragprune_plugins.constants import NEAR as NEAR
+from fragprune_plugins.constants import TRANSMITTANCE_MIN as TRANSMITTANCE_MIN
+from fragprune_plugins.errors import AlignmentError as AlignmentError
+from fragprune_plugins.errors import EngineError as EngineError
+from fragprune_plugins.errors import InputError as InputError
+from fragprune_plugins.errors import Interrupted as Interrupted
+from fragprune_plugins.errors import ModelFileError as ModelFileError
+from fragprune_plugins.errors import NotComparedError as NotComparedError
+from fragprune_plugins.errors import SessionError as SessionError
+from fragprune_plugins.errors import Terminated as Terminated
+from fragprune_plugins.errors import UsageError as UsageError
+from fragprune_plugins.files.atomic import replacing as replacing
+from fragprune_plugins.files.columns import change_of as change_of
+from fragprune_plugins.files.reading import Door as Door
+from fragprune_plugins.hosts.adapter import CHECKPOINT_KEY as CHECKPOINT_KEY
+from fragprune_plugins.hosts.adapter import GROUPS as GROUPS
+from fragprune_plugins.hosts.adapter import CommandLine as CommandLine
+from fragprune_plugins.hosts.adapter import ConfigFile as ConfigFile
+from fragprune_plugins.hosts.adapter import HostAdapter as HostAdapter
+from fragprune_plugins.hosts.adapter import HostInfo as HostInfo
+from fragprune_plugins.hosts.adapter import ParamGroup as ParamGroup
+from fragprune_plugins.hosts.adapter import ScriptAdapter as ScriptAdapter
+from fragprune_plugins.hosts.dialect import Dialect as Dialect
+from fragprune_plugins.hosts.dialect import HostCall as HostCall
+from fragprune_plugins.hosts.dialect import Place as Place
+from fragprune_plugins.hosts.dialect import Proof as Proof
+from fragprune_plugins.hosts.dialect import Prover as Prover
+from fragprune_plugins.hosts.findings import Finding as Finding
+from fragprune_plugins.hosts.findings import Plain as Plain
+from fragprune_plugins.hosts.photographs import WIDEST as WIDEST
+from fragprune_plugins.hosts.photographs import Photographs as Photographs
+from fragprune_plugins.hosts.photographs import Resolution as Resolution
+from fragprune_plugins.hosts.seams import Role as Role
+from fragprune_plugins.hosts.seams import RowTrace as RowTrace
+from fragprune_plugins.hosts.seams import Seam as Seam
+from fragprune_plugins.hosts.seams import SeamCall as SeamCall
+from fragprune_plugins.hosts.seams import revised as revised
+from fragprune_plugins.hosts.source import Function as Function
+from fragprune_plugins.hosts.source import HostRepo as HostRepo
+from fragprune_plugins.hosts.source import imported as imported
+from fragprune_plugins.hosts.source import is_off as is_off
+from fragprune_plugins.hosts.source import nodes as nodes
+from fragprune_plugins.hosts.source import off_by_default as off_by_default
+from fragprune_plugins.learning.goals import parse_goal as parse_goal
+from fragprune_plugins.plugins.hookspecs import hookimpl as hookimpl
+from fragprune_plugins.types import Footprints as Footprints
+from fragprune_plugins.types import RasterInputs as RasterInputs
+from fragprune_plugins.types import RasterOutputs as RasterOutputs
+from fragprune_plugins.types import Splats as Splats
+from fragprune_plugins.types import View as View
 
 if TYPE_CHECKING:
-    from fragprune_plugins.files.model import Model
-    from fragprune_plugins.files.ply import read_ply
-    from fragprune_plugins.files.sidecar import thresholds_of
+    from fragprune_plugins.files.model import Model as Model
+    from fragprune_plugins.files.ply import read_ply as read_ply
+    from fragprune_plugins.files.sidecar import thresholds_of as thresholds_of
 
 _LATE = {"Model": "model", "read_ply": "ply", "thresholds_of": "sidecar"}
-
-__all__ = [
-    "ALPHA_MIN",
-    "CHECKPOINT_KEY",
-    "GROUPS",
-    "NEAR",
-    "TRANSMITTANCE_MIN",
-    "WIDEST",
-    "AlignmentError",
-    "CommandLine",
-    "ConfigFile",
-    "Dialect",
-    "Door",
-    "EngineError",
-    "Finding",
-    "Footprints",
-    "Function",
-    "HostAdapter",
-    "HostCall",
-    "HostInfo",
-    "HostRepo",
-    "InputError",
-    "Interrupted",
-    "Model",
-    "ModelFileError",
-    "NotComparedError",
-    "ParamGroup",
-    "Photographs",
-    "Place",
-    "Plain",
-    "Proof",
-    "Prover",
-    "RasterInputs",
-    "RasterOutputs",
-    "Resolution",
-    "Role",
-    "RowTrace",
-    "ScriptAdapter",
-    "Seam",
-    "SeamCall",
-    "SessionError",
-    "Splats",
-    "Terminated",
-    "UsageError",
-    "View",
-    "change_of",
-    "hookimpl",
-    "imported",
-    "is_off",
-    "nodes",
-    "off_by_default",
-    "parse_goal",
-    "read_ply",
-    "replacing",
-    "revised",
-    "thresholds_of",
-]
 
 
 def __getattr__(name: str) -> Any:

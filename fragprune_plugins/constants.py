@@ -51,12 +51,6 @@ FOCAL_MIN: Final = 1e-3
 FOCAL_MAX: Final = 1e4
 """Focal lengths, in sides of the picture: fields of view from 179.9 to 0.006 degrees."""
 
-ROTATION_TOLERANCE: Final = 1e-2
-"""Most that R R^T of a camera's rotation differs from 1; matrices come rounded to a few digits."""
-
-DISTANCE_MAX: Final = 1e12
-"""Most world units of a camera from the origin: float32 holds its square with room to spare."""
-
 RIM_WIDTH: Final = 0.01
 """Width w, in falloff, of the surrogate s((g - tau)/w) at the rim; results are flat .003 to .03."""
 

@@ -33,13 +33,8 @@ class FragpruneError(Exception):
 
     def as_dict(self) -> dict[str, str]:
         """The message's parts, for ``--json``."""
-        return {
-            "code": self.code,
-            "where": self.where,
-            "found": self.found,
-            "expected": self.expected,
-            "remedy": self.remedy,
-        }
+        parts = ("code", "where", "found", "expected", "remedy")
+        return {name: getattr(self, name) for name in parts}
 
 
 class ModelFileError(FragpruneError):

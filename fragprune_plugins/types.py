@@ -22,8 +22,6 @@ from fragprune_plugins.constants import (
 from fragprune_plugins.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     import torch
     from torch import Tensor
 
@@ -102,12 +100,6 @@ def _is_whole(dtype: torch.dtype) -> bool:
     import torch
 
     return not (dtype.is_floating_point or dtype.is_complex or dtype is torch.bool)
-
-
-def _check_size(width: int, height: int) -> None:
-    """Raise InputError unless the picture has a pixel."""
-    if width < 1 or height < 1:
-        raise InputError("View", f"{width}x{height} pixels", "at least 1x1", "Check the camera.")
 
 
 def check_lens(
@@ -197,7 +189,9 @@ class View:
     __repr__ = one_line
 
     def __post_init__(self) -> None:
-        _check_size(self.width, self.height)
+        if self.width < 1 or self.height < 1:
+            found = f"{self.width}x{self.height} pixels"
+            raise InputError("View", found, "at least 1x1", "Check the camera.")
         require_tensor("View.viewmatrix", self.viewmatrix, 4, 4)
         require_tensor("View.projmatrix", self.projmatrix, 4, 4)
         require_tensor("View.campos", self.campos, 3)
@@ -264,61 +258,6 @@ class View:
             projmatrix=view @ clip,
             campos=-rotation.T @ translation,
             background=view.new_zeros(3) if background is None else background,
-        )
-
-    @classmethod
-    def look_at(
-        cls,
-        eye: Sequence[float] | Tensor,
-        target: Sequence[float] | Tensor,
-        up: Sequence[float] | Tensor = (0.0, -1.0, 0.0),
-        *,
-        width: int = 960,
-        height: int = 720,
-        fov_y: float = 50.0,
-        background: Tensor | None = None,
-    ) -> View:
-        """A camera at a place that looks at another; on the CPU, float32.
-
-        Args:
-            eye: (3,) camera centre in the world.
-            target: (3,) what is in the middle of the picture.
-            up: (3,) what is up in the picture, of any length; COLMAP's worlds have y down.
-            width: pixels.
-            height: pixels.
-            fov_y: vertical field of view, degrees in (0, 180).
-            background: (3,) RGB; black when None.
-
-        Raises:
-            InputError: eye equals target, it looks straight up or down, or fov_y is not in
-                (0, 180).
-        """
-        import torch
-
-        at, to, over = (torch.as_tensor(p, dtype=torch.float64).cpu() for p in (eye, target, up))
-        for name, point in (("eye", at), ("target", to), ("up", over)):
-            check_tensor(f"View.look_at {name}", point, 3)
-        forward = torch.nn.functional.normalize(to - at, dim=0)
-        right = torch.linalg.cross(forward, over)
-        straight = float(right.norm()) > 1e-6 * float(over.norm())  # False for NaN, too
-        if not straight or not 0 < fov_y < 180:
-            raise InputError(
-                "View.look_at",
-                f"eye {at.tolist()}, target {to.tolist()}, up {over.tolist()}, fov_y {fov_y:g}",
-                "a target apart from the eye, up not along the way there, and fov_y in (0, 180)",
-                "Move one of them.",
-            )
-        right = torch.nn.functional.normalize(right, dim=0)
-        rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
-        focal = height / (2 * math.tan(math.radians(fov_y) / 2))
-        return cls.pinhole(
-            rotation.float(),
-            (-rotation @ at).float(),
-            width=width,
-            height=height,
-            fx=focal,
-            fy=focal,
-            background=background,
         )
 
 
@@ -571,10 +510,6 @@ class RasterInputs:
             thresholds: (N,) falloff in (0, 1), of any floating type; None for no truncation.
         """
         check_tensor("thresholds", thresholds, len(self.splats))
-
-    def with_counts(self) -> RasterInputs:
-        """The same inputs with ``counts`` on."""
-        return replace(self, counts=True)
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,6 @@ from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.engines.cpu import engine as cpu
 from fragprune_plugins.engines.cpu.memory import keep_freed_memory
 from fragprune_plugins.engines.losses import compiled_loss
-from fragprune_plugins.learning import losses
 from fragprune_plugins.learning.adam import EPSILON
 from fragprune_plugins.learning.goals import Control, Pressure
 from fragprune_plugins.learning.schedule import Schedule, Settings
@@ -49,7 +48,7 @@ from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.bench.machine import describe_machine
 from fragprune_plugins.workbench.bench.scene import make_scene, make_view
-from fragprune_plugins.workbench.finetune import loop
+from fragprune_plugins.workbench.finetune import loop, losses
 from fragprune_plugins.workbench.finetune.api import finetune
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Photograph
 
@@ -176,7 +175,7 @@ def time_losses(size: str) -> dict[str, float]:
     image, target = (torch.rand(3, height, width) for _ in range(2))
     image.requires_grad_()
     builds = {name: binding.open_build(name) for name in reversed(binding.usable_builds())}
-    codes = {"torch": losses.photometric_loss} | {
+    codes = {"torch": losses.torch_loss} | {
         name: partial(compiled_loss, library=library) for name, library in builds.items()
     }
     found = {}
@@ -225,7 +224,7 @@ def main() -> None:
     sizes = args.size or ["320x240", "640x480", "1280x960"]
     torch.set_num_threads(1 if args.loss else args.threads)
     if args.plain:
-        loop.photometric_loss, loop.make_adam = losses.photometric_loss, plain_adam
+        loop.photometric_loss, loop.make_adam = losses.torch_loss, plain_adam
     else:
         keep_freed_memory()
     columns: dict[str, dict[str, float]] = {}

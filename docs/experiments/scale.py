@@ -27,13 +27,14 @@ import torch
 
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.engines.cpu.memory import keep_freed_memory
-from fragprune_plugins.files.ply import read_ply, write_ply
+from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.bench.scene import make_scene, make_view
 from fragprune_plugins.workbench.finetune import loop
 from fragprune_plugins.workbench.finetune.api import finetune
+from fragprune_plugins.workbench.models.formats.ply import write_ply
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Photograph
 
 FALLOFF = 0.06

@@ -41,9 +41,9 @@ import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from scipy.spatial import cKDTree  # noqa: E402
 
-from fragprune_plugins.engines.losses import photometric_loss  # noqa: E402
 from fragprune_plugins.files.ply import read_ply  # noqa: E402
 from fragprune_plugins.types import View  # noqa: E402
+from fragprune_plugins.workbench.finetune.losses import photometric_loss  # noqa: E402
 from fragprune_plugins.workbench.scenes.dataset import load_dataset  # noqa: E402
 
 SH_DEGREE = 1

@@ -49,7 +49,7 @@ def part(count: int, rank: int, size: int) -> fp.Model:
 
 def shot(z: float) -> Grey:
     """A view along the corridor from one place in it."""
-    view = fp.View.look_at((0, 0, z), (0, 0, z + 1), width=480, height=320, fov_y=60)
+    view = fp.look_at((0, 0, z), (0, 0, z + 1), width=480, height=320, fov_y=60)
     return Grey(f"from {z:g}", view)
 
 

@@ -135,9 +135,9 @@ def write(out: Path) -> dict[str, Any]:
     Raises:
         OutputError: the folder cannot be written.
     """
-    from fragprune_plugins.files.atomic import writable_folder
     from fragprune_plugins.workbench.figures.metrics import psnr
     from fragprune_plugins.workbench.figures.pictures import save_image
+    from fragprune_plugins.workbench.models.written import writable_folder
 
     writable_folder(out)
     scenes: dict[str, Any] = {}

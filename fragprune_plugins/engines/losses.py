@@ -1,56 +1,22 @@
-"""The photometric loss by the fastest code that is here for where the images are."""
+"""The photometric loss in compiled code, for images on a CPU."""
 
 from __future__ import annotations
 
 import ctypes
-import importlib.util
 from functools import cache
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any
 
 import torch
+from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from fragprune_plugins.engines.calling import address, empty, expect_ok, native_threads, plain
 from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.errors import InputError
-from fragprune_plugins.learning import losses
 from fragprune_plugins.learning.losses import SSIM_WEIGHT
 from fragprune_plugins.types import short
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
-Code = Literal["cpu", "fused-ssim", "torch"]
-"""Who computes a loss. Results differ in their last bits."""
-
 _workspace = cache(binding.Workspace)
-
-
-def code_for(device: torch.device) -> Code:
-    """Who computes the loss of float32 images on a device."""
-    if device.type == "cpu" and binding.available():
-        return "cpu"
-    if device.type == "cuda" and importlib.util.find_spec("fused_ssim") is not None:
-        return "fused-ssim"
-    return "torch"
-
-
-def photometric_loss(image: Tensor, target: Tensor) -> Tensor:
-    """0.8 L1 + 0.2 (1 - SSIM) of two images (C, H, W); differentiable.
-
-    The compiled code and fused-ssim take float32 images, and give a gradient by the first alone;
-    torch does what they do not.
-    """
-    usual = image.dtype == target.dtype == torch.float32 and not target.requires_grad
-    code = code_for(image.device) if usual and image.device == target.device else "torch"
-    if code == "cpu":
-        return compiled_loss(image, target)
-    if code == "fused-ssim":
-        from fused_ssim import fused_ssim
-
-        ssim: Tensor = fused_ssim(image[None], target[None])
-        return (1 - SSIM_WEIGHT) * losses.l1(image, target) + SSIM_WEIGHT * (1 - ssim)
-    return losses.photometric_loss(image, target)
 
 
 def compiled_loss(
@@ -70,7 +36,7 @@ def compiled_loss(
         target: likewise, but a constant.
         l1_weight: factor on the mean absolute difference.
         ssim_weight: factor on 1 - SSIM, the mean over all pixels and channels as in
-            ``learning.losses.ssim``.
+            ``learning.losses.ssim_map``.
         library: the build to use; None for the best one on this machine.
 
     Raises:
@@ -79,7 +45,7 @@ def compiled_loss(
     """
     for name, tensor in (("image", image), ("target", target)):
         if tensor.device.type != "cpu" or tensor.dtype != torch.float32 or tensor.ndim != 3:
-            remedy = "learning.losses.photometric_loss takes any dtype and device."
+            remedy = "workbench.finetune.losses.photometric_loss takes any dtype and device."
             raise InputError(name, short(tensor), "(C, H, W) float32 on the cpu", remedy)
     if image.shape != target.shape:
         raise InputError(

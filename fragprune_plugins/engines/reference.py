@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
 from dataclasses import fields
 from typing import TYPE_CHECKING
 
-from fragprune_plugins.constants import TILE
 from fragprune_plugins.engines.calling import with_joined_sh
 from fragprune_plugins.types import (
     Footprints,
@@ -16,12 +13,10 @@ from fragprune_plugins.types import (
     Splats,
 )
 from reference_renderer import (
-    Blended,
     Camera,
     Gaussians,
     Options,
     Rendering,
-    blended,
     render,
     render_footprints,
 )
@@ -56,32 +51,6 @@ class ReferenceEngine:
             winners=drawn.winners if inputs.scores else None,
             surface=drawn.surface,
         )
-
-
-def fragments(
-    inputs: RasterInputs, thresholds: Tensor | None, tiles: int | None = None
-) -> Iterator[Blended]:
-    """The fragments themselves, tile by tile, for what no engine sums up. Slow.
-
-    Args:
-        inputs: Gaussians in the world.
-        thresholds: (N,) falloff in (0, 1), or None for no truncation.
-        tiles: how many tiles are looked at, at most, evenly spread; None for all.
-    """
-    assert isinstance(inputs.splats, Splats)
-    inputs.check_thresholds(thresholds)
-    view = inputs.view
-    across, down = -(-view.width // TILE), -(-view.height // TILE)
-    every = 1 if tiles is None else -(-across * down // tiles)
-    while math.gcd(every, across) > 1:  # else the same columns of every row
-        every += 1
-    return blended(
-        camera_of(inputs),
-        gaussians_of(inputs.splats),
-        thresholds,
-        options=options_of(inputs),
-        every=every,
-    )
 
 
 def _draw(inputs: RasterInputs, thresholds: Tensor | None) -> Rendering:

@@ -162,27 +162,6 @@ def rename(old: Path, new: Path) -> None:
             os.close(handle)
 
 
-def writable_folder(path: Path) -> Path:
-    """Create the folder if it is missing, and check that a file can be made in it; returns it.
-
-    Raises:
-        OutputError: the folder cannot be written.
-    """
-    path = Path(path)
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path):
-            pass
-    except OSError as error:
-        raise OutputError(
-            str(path),
-            f"cannot be written ({error.strerror or error})",
-            "a folder one can write to",
-            "Choose another output folder.",
-        ) from error
-    return path
-
-
 def digest(path: Path) -> str:
     """The SHA-256 digest of a file, hexadecimal."""
     sha = hashlib.sha256()

@@ -126,12 +126,8 @@ class Model:
         """The same Gaussians without thresholds and stop."""
         return replace(self, thresholds=None)
 
-    def with_stop(self, stop: float) -> Model:
-        """The same model with another stop, from 1e-4 to 1."""
-        return self.with_rules(stop=float(stop))
-
     def with_rules(self, **rules: Any) -> Model:
-        """The same model with other ``rules``: a stop, a rim."""
+        """The same model with other ``rules``: a stop from 1e-4 to 1, a rim."""
         known = self.thresholds
         store = ThresholdStore(len(self), self.device) if known is None else known.clone()
         return replace(self, thresholds=store.ruled(**rules))

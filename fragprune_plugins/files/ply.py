@@ -23,7 +23,6 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.errors import ModelFileError
-from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.columns import change_of, is_plain
 from fragprune_plugins.files.model import REST_COUNTS, Model
 from fragprune_plugins.files.ply_table import HEADER_MAX, Columns, header_lines, read_vertices
@@ -38,11 +37,11 @@ STOP = "fragprune stop"
 RIM = "fragprune rim"
 """Begins the comment that says how a model's thresholds cut, if not hard."""
 
-_XYZ = ("x", "y", "z")
-_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
-_SCALES = ("scale_0", "scale_1", "scale_2")
-_ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
-_FILTER = "filter_3D"
+XYZ = ("x", "y", "z")
+DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+SCALES = ("scale_0", "scale_1", "scale_2")
+ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
+FILTER = "filter_3D"
 _REMEDY = "Pass the point_cloud.ply that a 3DGS training saved."
 _DOOR = Door(
     ModelFileError,
@@ -109,9 +108,9 @@ def _rules_in(reading: Reading) -> dict[str, Any]:
 def _splat(path: Path, columns: Columns, filtered: bool) -> Model:
     """The splat of a file's columns; raises ModelFileError."""
     names, count = columns.keys(), len(next(iter(columns.values())))
-    scales = _SCALES if _SCALES[2] in names else _SCALES[:2]
-    missing = [name for name in (*_XYZ, *_DC, "opacity", *scales, *_ROTATION) if name not in names]
-    if missing == list(_DC):
+    scales = SCALES if SCALES[2] in names else SCALES[:2]
+    missing = [name for name in (*XYZ, *DC, "opacity", *scales, *ROTATION) if name not in names]
+    if missing == list(DC):
         raise ModelFileError(
             str(path),
             "activated Gaussians without colours, from a codebase that keeps colours in a network",
@@ -125,21 +124,21 @@ def _splat(path: Path, columns: Columns, filtered: bool) -> Model:
             "the columns of a Gaussian splat",
             "A point cloud or mesh is not a trained splat. " + _REMEDY,
         )
-    if scales != _SCALES and not filtered:
+    if scales != SCALES and not filtered:
         raise ModelFileError(
             str(path),
             "flat Gaussians with two scales, as 2D Gaussian Splatting saves, and no 3D Gaussians",
             "a splat of 3D Gaussians",
             "Fine-tune and draw it through its host's own scripts, with fragprune run.",
         )
-    if _FILTER in names and not filtered:
+    if FILTER in names and not filtered:
         raise ModelFileError(
             str(path),
             "a Mip-Splatting model, whose 3D filter (filter_3D) changes shapes and opacities",
             "a splat that is drawn as it is stored",
             "Fuse the filter first (create_fused_ply.py there), or fine-tune with fragprune run.",
         )
-    _expect_no_other(path, [name for name in names if not is_plain(name) and name != _FILTER])
+    _expect_no_other(path, [name for name in names if not is_plain(name) and name != FILTER])
     rest = sorted(
         (name for name in names if name.startswith("f_rest_") and name[7:].isdecimal()),
         key=lambda name: (len(name), name),
@@ -165,16 +164,16 @@ def _splat(path: Path, columns: Columns, filtered: bool) -> Model:
         return torch.from_numpy(data)
 
     splat = Model(
-        xyz=column(*_XYZ),
-        f_dc=column(*_DC)[:, None, :],
+        xyz=column(*XYZ),
+        f_dc=column(*DC)[:, None, :],
         f_rest=column(*np.reshape(rest, (3, -1)).T.flat).reshape(count, len(rest) // 3, 3),
         opacity=column("opacity"),
         scaling=column(*scales),
-        rotation=column(*_ROTATION),
+        rotation=column(*ROTATION),
         thresholds=(
             _store_of(path, column(THRESHOLD_COLUMN)[:, 0]) if THRESHOLD_COLUMN in names else None
         ),
-        filter_3d=column(_FILTER) if _FILTER in names else None,
+        filter_3d=column(FILTER) if FILTER in names else None,
     )
     expect_drawable(path, splat)
     return splat
@@ -200,47 +199,6 @@ def _expect_no_other(path: Path, others: list[str]) -> None:
 def _warn(message: str) -> None:
     """Say something once: commands read a file several times."""
     log.warning(message)
-
-
-def write_ply(path: Path, model: Model) -> None:
-    """Write a model atomically in the hosts' layout, with the exact values that ``read_ply`` gave.
-
-    Args:
-        path: the file; an existing one is replaced only when the new one is complete.
-        model: the Gaussians; thresholds that cut become the last column, ``trunc_threshold``, and
-            a stop and a soft rim comments.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    from plyfile import PlyData, PlyElement
-
-    n = len(model)
-    rest = model.f_rest.transpose(1, 2).reshape(n, -1)
-    columns: list[tuple[tuple[str, ...], Tensor]] = [
-        (_XYZ, model.xyz),
-        (("nx", "ny", "nz"), torch.zeros(n, 3)),
-        (_DC, model.f_dc[:, 0]),
-        (tuple(f"f_rest_{i}" for i in range(rest.shape[1])), rest),
-        (("opacity",), model.opacity),
-        (_SCALES[: model.scaling.shape[1]], model.scaling),
-        (_ROTATION, model.rotation),
-    ]
-    if model.filter_3d is not None:
-        columns.append(((_FILTER,), model.filter_3d))
-    if (falloff := model.falloff) is not None:
-        columns.append(((THRESHOLD_COLUMN,), falloff.reshape(n, 1)))
-    names = [name for group, _ in columns for name in group]
-    table = torch.cat([values.detach().cpu().float() for _, values in columns], dim=1)
-    rows = np.ascontiguousarray(table.numpy()).view([(name, "<f4") for name in names])[:, 0]
-    # An element's comments come after its line: some viewers read the number of Gaussians off the
-    # header's third line, whatever it says.
-    comments = [] if model.stop is None else [f"{STOP} {model.stop!r}"]
-    if model.rim != "hard":
-        comments.append(f"{RIM} {model.rim}")
-    vertices = PlyElement.describe(rows, "vertex", comments=comments)
-    with replacing(path) as temporary:
-        PlyData([vertices], byte_order="<").write(str(temporary))
 
 
 def read_thresholds(path: Path) -> ThresholdStore | None:

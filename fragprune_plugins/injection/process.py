@@ -9,6 +9,7 @@ import runpy
 import sys
 import traceback
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NoReturn
 from unittest import mock
@@ -163,11 +164,10 @@ def current_gpu(device: str) -> Iterator[None]:
         yield
 
 
-@contextlib.contextmanager
-def host_checkpoints() -> Iterator[None]:
+def host_checkpoints() -> AbstractContextManager[None]:
     """Inside, torch's safe loader reads hosts' checkpoints."""
-    with torch.serialization.safe_globals(checkpoint_values()):
-        yield
+    context: AbstractContextManager[None] = torch.serialization.safe_globals(checkpoint_values())
+    return context
 
 
 def checkpoint_values() -> list[Any]:

@@ -9,7 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fragprune_plugins.engines.losses import code_for, compiled_loss
+from fragprune_plugins.engines.cpu import binding
+from fragprune_plugins.engines.losses import compiled_loss
 from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.state import SessionState
@@ -55,7 +56,7 @@ def images(call: SeamCall) -> tuple[Tensor, Tensor] | None:
     for each in pair:
         if not isinstance(each, Tensor) or each.dtype != torch.float32:
             return None
-        if code_for(each.device) != "cpu" or each.ndim not in (3, 4):
+        if each.device.type != "cpu" or not binding.available() or each.ndim not in (3, 4):
             return None
     if pair[0].shape != pair[1].shape or (pair[0].ndim == 4 and len(pair[0]) != 1):
         return None

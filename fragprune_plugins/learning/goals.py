@@ -64,14 +64,29 @@ class Goal:
 
 @dataclass(frozen=True)
 class _Weighted(Goal):
-    """A goal with a weight, lambda, which a number may give."""
+    """A goal with a weight, lambda, which a number may give.
 
+    Attributes:
+        own: the weight for a model that learns from its own pictures.
+    """
+
+    own: ClassVar[float] = OWN_PRESSURE
     weight: float | None = None
 
     def __post_init__(self) -> None:
         if self.weight is not None and not 0 <= number("pressure", self.weight) < 1:
             expected = "0 <= X < 1 (1e-4 is usual)"
             raise UsageError("pressure", f"{self.weight:g}", expected, "Change it.")
+
+    def pressure(self, elasticity: float, itself: bool) -> PressureRule:
+        """The weight; without one, fixed where there is no loss to follow, else elastic."""
+        if self.weight is not None:
+            return FixedPressure(self.weight)
+        return FixedPressure(self.own) if itself else self.elastic(elasticity)
+
+    def elastic(self, elasticity: float) -> PressureRule:
+        """A pressure that follows the loss."""
+        return ElasticPressure(elasticity=elasticity)
 
 
 @dataclass(frozen=True)
@@ -84,12 +99,6 @@ class Pressure(_Weighted):
     """
 
     name: ClassVar[str] = "pressure"
-
-    def pressure(self, elasticity: float, itself: bool) -> PressureRule:
-        """The weight; without one, elastic, or fixed where there is no loss to follow."""
-        if self.weight is not None:
-            return FixedPressure(self.weight)
-        return FixedPressure(OWN_PRESSURE) if itself else ElasticPressure(elasticity=elasticity)
 
 
 @dataclass(frozen=True)
@@ -128,13 +137,10 @@ class Portable(_Weighted):
     name: ClassVar[str] = "portable"
     learns: ClassVar[bool] = False
     on_area: ClassVar[bool] = True
+    own: ClassVar[float] = OWN_AREA_PRESSURE
 
-    def pressure(self, elasticity: float, itself: bool) -> PressureRule:
-        """The weight; without one, elastic, or fixed where there is no loss to follow."""
-        if self.weight is not None:
-            return FixedPressure(self.weight)
-        if itself:
-            return FixedPressure(OWN_AREA_PRESSURE)
+    def elastic(self, elasticity: float) -> PressureRule:
+        """Of the loss per pixel of area."""
         return ElasticPressure(value=0.0, elasticity=PORTABLE_ELASTICITY, least=0.0, most=1.0)
 
 

@@ -1,4 +1,4 @@
-"""The photometric loss that descendants of 3DGS train with: 0.8 L1 + 0.2 (1 - SSIM)."""
+"""Structural similarity as descendants of 3DGS have it in their loss, 0.8 L1 + 0.2 (1 - SSIM)."""
 
 from __future__ import annotations
 
@@ -15,23 +15,13 @@ SSIM_WEIGHT = 0.2
 _C1, _C2 = 0.01**2, 0.03**2
 
 
-def l1(image: Tensor, target: Tensor) -> Tensor:
-    """Mean absolute difference of two images (3, H, W)."""
-    return (image - target).abs().mean()
-
-
-def ssim(image: Tensor, target: Tensor) -> Tensor:
-    """Mean structural similarity of two images (C, H, W) in [0, 1]; differentiable.
+def ssim_map(image: Tensor, target: Tensor) -> Tensor:
+    """(C, H, W) structural similarity at each pixel of two images in [0, 1]; differentiable.
 
     An 11x11 Gaussian window of sigma 1.5, zero padding at the border as in the hosts' loss, each
-    channel for itself. For a figure to quote use ``measure.metrics.ssim``, which leaves the border
+    channel for itself. For a figure to quote use ``figures.metrics.ssim``, which leaves the border
     out.
     """
-    return ssim_map(image, target).mean()
-
-
-def ssim_map(image: Tensor, target: Tensor) -> Tensor:
-    """(C, H, W) structural similarity at each pixel; see ``ssim``."""
     maps = torch.stack([image, target, image * image, target * target, image * target])
     mu_x, mu_y, xx, yy, xy = _blur(maps)
     var_x, var_y, cov = xx - mu_x * mu_x, yy - mu_y * mu_y, xy - mu_x * mu_y
@@ -39,11 +29,6 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
     bottom = (mu_x * mu_x + mu_y * mu_y + _C1) * (var_x + var_y + _C2)
     similarity: Tensor = top / bottom
     return similarity
-
-
-def photometric_loss(image: Tensor, target: Tensor) -> Tensor:
-    """0.8 L1 + 0.2 (1 - SSIM) of two images (3, H, W)."""
-    return (1 - SSIM_WEIGHT) * l1(image, target) + SSIM_WEIGHT * (1 - ssim(image, target))
 
 
 @cache

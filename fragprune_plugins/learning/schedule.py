@@ -9,7 +9,6 @@ from typing import Any, Literal, get_args
 
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.goals import Goal, Pressure
-from fragprune_plugins.learning.plain import numbers_of
 from fragprune_plugins.learning.pressure import ELASTICITY, PressureRule
 from fragprune_plugins.types import Rim, is_stop
 
@@ -223,15 +222,6 @@ class Schedule:
     def make_pressure(self) -> PressureRule:
         """The pressure of the run, a new one."""
         return self.settings.make_pressure()
-
-    def as_dict(self) -> dict[str, Any]:
-        """What decides beside the settings, as plain values: its numbers and its pressure's."""
-        pressure = self.make_pressure()
-        return {
-            "kind": type(self).__qualname__,
-            **numbers_of(self),
-            "pressure": {"kind": type(pressure).__qualname__, **numbers_of(pressure)},
-        }
 
 
 def _share(steps: int, of: int) -> float:

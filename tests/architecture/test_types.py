@@ -14,7 +14,7 @@ SCRIPT = """
 import fragprune_plugins as fp
 
 model = fp.load("model.ply")
-view = fp.View.look_at((0, 0, -3), (0, 0, 0))
+view = fp.look_at((0, 0, -3), (0, 0, 0))
 reveal_type(model)
 reveal_type(fp.render_view(model, view))
 reveal_type(fp.ThresholdStore.from_alpha)

@@ -7,8 +7,8 @@ import pytest
 from cli.commands import run, run_json
 from finetune import tiny
 
-from fragprune_plugins.files.ply import write_ply
 from fragprune_plugins.workbench.bench import work
+from fragprune_plugins.workbench.models.formats.ply import write_ply
 
 SMALL = ("--size", "40x30", "--gaussians", 200)
 

@@ -10,11 +10,12 @@ from browser.chromium import opened, served
 from browser.engines import NoEnginesError, drawing, engines, install
 from cli.commands import run
 
-from fragprune_plugins import RasterInputs, View, rasterize
+from fragprune_plugins import RasterInputs, rasterize
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.files.ply import write_ply
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.workbench.models.cutoffs import decode, encode
+from fragprune_plugins.workbench.models.formats.ply import write_ply
+from fragprune_plugins.workbench.scenes.pinhole import look_at
 
 pytestmark = pytest.mark.browser
 Error = pytest.importorskip("playwright.sync_api").Error
@@ -80,7 +81,7 @@ def codes(splat):
 @pytest.fixture(scope="module")
 def view():
     eye, target, up = torch.tensor([[0.1, -0.2, 0.0], [0.0, 0.0, 3.0], [0.0, -1.0, 0.0]])
-    return View.look_at(eye, target, up, width=160, height=120, fov_y=50)
+    return look_at(eye, target, up, width=160, height=120, fov_y=50)
 
 
 @pytest.fixture(scope="module")

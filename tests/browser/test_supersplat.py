@@ -13,7 +13,8 @@ from browser.chromium import opened, served
 from cli.commands import run_json
 from finetune import tiny
 
-from fragprune_plugins.files.ply import read_ply, write_ply
+from fragprune_plugins.files.ply import read_ply
+from fragprune_plugins.workbench.models.formats.ply import write_ply
 
 pytestmark = pytest.mark.browser
 
@@ -45,7 +46,7 @@ def built():
 
 
 def test_an_edited_file_gets_its_cutoffs_back(tmp_path, built, browser):
-    pruned = tiny.cut(tiny.random_model(), torch.linspace(0.1, 0.9, 60)).with_stop(0.02)
+    pruned = tiny.cut(tiny.random_model(), torch.linspace(0.1, 0.9, 60)).with_rules(stop=0.02)
     site, edited, out = tmp_path / "site", tmp_path / "edited.ply", tmp_path / "out.ply"
     site.mkdir()
     for each in built.iterdir():

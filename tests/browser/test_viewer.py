@@ -146,7 +146,7 @@ def test_full_pixels_are_left_alone_and_look_the_same(browser, tmp_path):
 
 def test_pixels_stop_as_the_models_do_a_few_fragments_later(browser, tmp_path):
     view, stop = a_view(), 0.05
-    stopped = a_model(count=6000).with_stop(stop)
+    stopped = a_model(count=6000).with_rules(stop=stop)
     write_page(tmp_path, [a_model(count=6000), stopped], view)
     with viewing(browser, tmp_path) as tab:
         hold(tab, view)

@@ -1,7 +1,7 @@
 import pytest
 from finetune import tiny
 
-from fragprune_plugins.files.ply import write_ply
+from fragprune_plugins.workbench.models.formats.ply import write_ply
 
 
 @pytest.fixture

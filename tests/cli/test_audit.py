@@ -10,7 +10,7 @@ from cli.commands import fails, run, run_json
 from finetune import tiny
 from PIL import Image
 
-from fragprune_plugins.files.ply import write_ply
+from fragprune_plugins.workbench.models.formats.ply import write_ply
 
 
 @pytest.fixture(scope="module")

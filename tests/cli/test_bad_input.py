@@ -7,8 +7,8 @@ from cli.commands import fails, run, run_error
 from finetune import tiny
 
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.files.ply import write_ply
 from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.workbench.models.formats.ply import write_ply
 
 
 @pytest.fixture

@@ -7,11 +7,11 @@ import torch
 from cli.commands import run, run_json
 from finetune import tiny
 
-from fragprune_plugins.files.ply import write_ply
 from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.figures import evaluate
 from fragprune_plugins.workbench.figures.drawing import rasterize
 from fragprune_plugins.workbench.figures.metrics import psnr
+from fragprune_plugins.workbench.models.formats.ply import write_ply
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
 
 FIGURES = ("psnr", "ssim", "fragments_per_pixel", "gaussians")

@@ -8,8 +8,9 @@ from cli.commands import fails, run, run_json
 from finetune import tiny
 
 import fragprune_plugins as fp
-from fragprune_plugins.files.ply import read_ply, write_ply
+from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.workbench.models import model as models
+from fragprune_plugins.workbench.models.formats.ply import write_ply
 
 
 def test_one_file_with_the_thresholds(tmp_path):
@@ -77,7 +78,7 @@ def edited(model, rows):
 
 @pytest.fixture
 def pruned(tmp_path):
-    model = tiny.cut(tiny.random_model(), torch.linspace(0.1, 0.9, 60)).with_stop(0.02)
+    model = tiny.cut(tiny.random_model(), torch.linspace(0.1, 0.9, 60)).with_rules(stop=0.02)
     write_ply(tmp_path / "pruned.ply", model)
     return model
 

@@ -12,11 +12,12 @@ from finetune import tiny
 
 import fragprune_plugins as fp
 from fragprune_plugins.files import records, sidecar
-from fragprune_plugins.files.ply import read_ply, write_ply
+from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.learning.pressure import LEAST_PRESSURE
 from fragprune_plugins.workbench.finetune import loop
 from fragprune_plugins.workbench.finetune.finished import advise_own_pictures, describe_untruncated
 from fragprune_plugins.workbench.goals import parse_goal
+from fragprune_plugins.workbench.models.formats.ply import write_ply
 
 
 @pytest.fixture

@@ -10,8 +10,8 @@ from finetune import tiny
 from PIL import Image
 
 from fragprune_plugins.errors import DatasetError, ModelFileError
-from fragprune_plugins.files.ply import write_ply
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
+from fragprune_plugins.workbench.models.formats.ply import write_ply
 from fragprune_plugins.workbench.scenes.output import newest_model, trained_on
 
 

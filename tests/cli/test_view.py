@@ -10,7 +10,7 @@ from cli.commands import fails, run_json
 from finetune import tiny
 
 from fragprune_plugins.files import records
-from fragprune_plugins.files.ply import write_ply
+from fragprune_plugins.workbench.models.formats.ply import write_ply
 from fragprune_plugins.workbench.view import server as serving
 
 

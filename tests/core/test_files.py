@@ -17,8 +17,8 @@ from fragprune_plugins.files.atomic import (
     locked,
     put,
     replacing,
-    writable_folder,
 )
+from fragprune_plugins.workbench.models.written import writable_folder
 
 
 def test_the_new_file_appears_whole_under_its_name(tmp_path):

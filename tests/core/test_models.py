@@ -8,7 +8,7 @@ from finetune import tiny
 import fragprune_plugins as fp
 from fragprune_plugins.errors import DivergedError, OutputError
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.files.ply import write_ply
+from fragprune_plugins.workbench.models.formats.ply import write_ply
 
 
 @pytest.fixture

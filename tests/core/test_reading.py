@@ -25,12 +25,13 @@ from fragprune_plugins.errors import (
     UsageError,
 )
 from fragprune_plugins.files import records, sidecar
-from fragprune_plugins.files.ply import read_ply, read_thresholds, write_ply
+from fragprune_plugins.files.ply import read_ply, read_thresholds
 from fragprune_plugins.files.reading import NESTING, Door, lies_in
 from fragprune_plugins.hosts.adapter import ConfigFile, read_config
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.starting import _read_checkpoint
 from fragprune_plugins.types import View
+from fragprune_plugins.workbench.models.formats.ply import write_ply
 from fragprune_plugins.workbench.scenes import colmap
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
 from fragprune_plugins.workbench.scenes.dataset import Photograph

@@ -38,7 +38,7 @@ def test_a_dataclass_with_tensors_is_shown_short(kind):
 def values():
     splat = tiny.random_model(count=500)
     inputs = fp.RasterInputs(tiny.cameras()[0].view(), splat.splats())
-    outputs = fp.rasterize(inputs.with_counts())
+    outputs = fp.rasterize(replace(inputs, counts=True))
     store = fp.ThresholdStore(500)
     model = replace(splat, thresholds=store)
     return [inputs.view, inputs.splats, inputs, outputs, splat, store, model]

@@ -8,8 +8,8 @@ from safetensors.torch import load_file, save_file
 
 from fragprune_plugins.errors import DivergedError, OutputError, SidecarError
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.files.ply import write_ply
 from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.workbench.models.formats.ply import write_ply
 
 
 @pytest.fixture

@@ -16,7 +16,8 @@ from finetune import tiny
 import fragprune_plugins as fp
 from fragprune_plugins.errors import OutputError
 from fragprune_plugins.files import atomic, sidecar
-from fragprune_plugins.files.ply import read_ply, write_ply
+from fragprune_plugins.files.ply import read_ply
+from fragprune_plugins.workbench.models.formats.ply import write_ply
 
 SPLAT = tiny.random_model(20)
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn.functional import conv2d
 
-from fragprune_plugins.learning.losses import l1, photometric_loss, ssim
+from fragprune_plugins.workbench.finetune.losses import l1, ssim, torch_loss
 
 
 @pytest.fixture
@@ -64,10 +64,10 @@ def test_ssim_agrees_with_scikit_image_inside(pair):
 
 def test_equal_images_lose_nothing(pair):
     _, target = pair
-    assert float(photometric_loss(target, target)) == pytest.approx(0, abs=1e-6)
+    assert float(torch_loss(target, target)) == pytest.approx(0, abs=1e-6)
     assert float(l1(target, target)) == 0
 
 
 def test_gradient(pair):
     x, y = (z[:, :14, :13].double() for z in pair)
-    assert torch.autograd.gradcheck(lambda z: photometric_loss(z, y), x.requires_grad_())
+    assert torch.autograd.gradcheck(lambda z: torch_loss(z, y), x.requires_grad_())

@@ -13,7 +13,8 @@ from plyfile import PlyData, PlyElement
 
 from fragprune_plugins.errors import InputError, ModelFileError
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.files.ply import expect_drawable, read_ply, write_ply
+from fragprune_plugins.files.ply import expect_drawable, read_ply
+from fragprune_plugins.workbench.models.formats.ply import write_ply
 
 
 def same(a: Model, b: Model) -> bool:

@@ -16,10 +16,10 @@ from PIL import Image
 
 from fragprune_plugins import rasterize
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.files.ply import write_ply
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.finetune import faster, loop
+from fragprune_plugins.workbench.models.formats.ply import write_ply
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Photograph
 from fragprune_plugins.workbench.scenes.pinhole import Camera
 

@@ -16,8 +16,8 @@ from finetune import tiny
 from formats.scenes import apart, random_splat
 
 from fragprune_plugins import load, save
-from fragprune_plugins.files.ply import write_ply
 from fragprune_plugins.workbench.models import formats
+from fragprune_plugins.workbench.models.formats.ply import write_ply
 
 pytestmark = [pytest.mark.npm, pytest.mark.timeout(600)]
 

@@ -18,8 +18,9 @@ from hypothesis import HealthCheck, given, settings
 from fragprune_plugins import ThresholdStore, load, save
 from fragprune_plugins.errors import FragpruneError, ModelFileError, OutputError
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.files.ply import read_ply, write_ply
+from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.workbench.models import cutoffs, formats
+from fragprune_plugins.workbench.models.formats.ply import write_ply
 from fragprune_plugins.workbench.models.formats.values import morton_order, turned
 
 # Half a step of each format's own quantisation, with the values that ``random_splat`` has.

@@ -15,8 +15,8 @@ from formats.scenes import random_splat
 from PIL import Image
 
 from fragprune_plugins import ThresholdStore, load, save
-from fragprune_plugins.files.ply import write_ply
 from fragprune_plugins.workbench.models import cutoffs
+from fragprune_plugins.workbench.models.formats.ply import write_ply
 
 PAGE = (Path(__file__).parents[2] / "docs/reference/cutoff.md").read_text(encoding="utf-8")
 COUNT = 30
@@ -26,7 +26,7 @@ COUNT = 30
 def model():
     tau = torch.linspace(0.01, 0.95, COUNT)
     pruned = replace(random_splat(COUNT, 1, 0), thresholds=ThresholdStore.from_falloff(tau))
-    return pruned.with_stop(0.01)
+    return pruned.with_rules(stop=0.01)
 
 
 @pytest.fixture

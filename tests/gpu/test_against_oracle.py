@@ -118,7 +118,7 @@ def test_deterministic_runs_agree_to_the_bit_whatever_the_order(device: Emulated
 def test_images_counts_and_scores_do_not_depend_on_the_order(
     engine: CudaEngine, device: EmulatedDevice
 ) -> None:
-    inputs = replace(scenes.random_scene(4, 300, 70, 50), scores=True).with_counts()
+    inputs = replace(scenes.random_scene(4, 300, 70, 50), scores=True, counts=True)
     found = []
     for device.seed in (1, 2):
         found.append(engine.rasterize(inputs, None))
@@ -136,7 +136,7 @@ def test_images_counts_and_scores_do_not_depend_on_the_order(
 def test_larger_scenes_equal_the_cpu_engine(
     engine: CudaEngine, n: int, width: int, height: int, size: float
 ) -> None:
-    inputs = scenes.random_scene(3, n, width, height, scale_modifier=size).with_counts()
+    inputs = replace(scenes.random_scene(3, n, width, height, scale_modifier=size), counts=True)
     thresholds = scenes.random_thresholds(3, n)
     with torch.no_grad():
         expected = CpuEngine().rasterize(inputs, thresholds)

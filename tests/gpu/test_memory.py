@@ -4,6 +4,7 @@ import gc
 import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import pytest
 import scenes
@@ -42,7 +43,7 @@ def drawings(monkeypatch: pytest.MonkeyPatch) -> list[weakref.ref]:
 def step(engine: CudaEngine, counts: bool = False, backward: bool = True) -> None:
     engine._capacity = 512  # the emulation is slow
     made, _ = scenes.leaves(scenes.random_scene(0, features=3))
-    made = made.with_counts() if counts else made
+    made = replace(made, counts=True) if counts else made
     out = engine.rasterize(made, scenes.random_thresholds(0, 60).requires_grad_())
     if backward:
         (out.image.sum() + out.features.sum() + out.fragments_per_pixel).backward()

@@ -35,7 +35,7 @@ def gradients(engine, inputs: RasterInputs, thresholds: torch.Tensor, same: torc
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_images_and_gradients_equal_the_oracle(engine: CudaEngine, kind: str) -> None:
-    inputs = scenes.cast(dialect(1, **KINDS[kind]), torch.float32, "cuda").with_counts()
+    inputs = replace(scenes.cast(dialect(1, **KINDS[kind]), torch.float32, "cuda"), counts=True)
     thresholds = scenes.random_thresholds(1, 60, device="cuda")
     wide = scenes.cast(inputs, torch.float64, "cuda")
     truth = ReferenceEngine().rasterize(wide, thresholds.double())
@@ -57,7 +57,7 @@ def test_the_check_that_comes_before_use_is_passed() -> None:
 def test_runs_agree_to_the_bit_at_size(engine: CudaEngine) -> None:
     inputs = scenes.random_scene(0, 200_000, 1300, 900, scale_modifier=0.3, device="cuda")
     thresholds = scenes.random_thresholds(0, 200_000, device="cuda")
-    inputs = replace(inputs, scores=True).with_counts()
+    inputs = replace(inputs, scores=True, counts=True)
     found = []
     for _ in range(3):
         made, leaves = scenes.leaves(inputs)

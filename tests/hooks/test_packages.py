@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from finetune import tiny
 
-from fragprune_plugins.files.ply import write_ply
+from fragprune_plugins.workbench.models.formats.ply import write_ply
 
 if sys.version_info >= (3, 11):
     import tomllib

@@ -10,7 +10,7 @@ from finetune import tiny
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fragprune_plugins.engines.reference import ReferenceEngine, fragments
+from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins.hooks import engine_for
 from fragprune_plugins.types import RasterInputs
@@ -24,6 +24,7 @@ from fragprune_plugins.workbench.audit.audit import (
     audit,
     weigh,
 )
+from fragprune_plugins.workbench.audit.fragments import fragments
 from reference_renderer.composite import transmittances
 
 ENGINE = engine_for("auto", "cpu")
@@ -159,7 +160,7 @@ def test_a_stop_is_priced_on_a_model_without_one_and_is_its_own_on_another():
     splat, views = tiny.random_model(), [("view", tiny.cameras()[0].view())]
     plain, _ = audit(splat, views, engine=ENGINE, repeats=1)
     priced = plain["cuts"][-1]
-    stopped, _ = audit(splat.with_stop(0.01), views, engine=ENGINE, repeats=1)
+    stopped, _ = audit(splat.with_rules(stop=0.01), views, engine=ENGINE, repeats=1)
     assert (plain["stop"], stopped["stop"]) == (None, 0.01)
     assert priced["name"] == "a stop at 0.01"
     assert priced["fragments_per_pixel"] == stopped["fragments_per_pixel"]

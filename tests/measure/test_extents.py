@@ -8,8 +8,9 @@ from finetune import tiny
 
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.types import RasterInputs, View
+from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.figures.extents import CUTS, SQRT8, VIEWERS, Extent, Viewer, shaded
+from fragprune_plugins.workbench.scenes.pinhole import look_at
 
 BY_NAME = {viewer.names.split(",")[0]: viewer for viewer in VIEWERS}
 
@@ -24,7 +25,7 @@ def one(opacity=0.5, size=0.2):
         scaling=torch.full((1, 3), math.log(size)),
         rotation=torch.tensor([[1.0, 0, 0, 0]]),
     )
-    view = View.look_at((0, 0, -4), (0, 0, 0), width=160, height=160, fov_y=53.13)
+    view = look_at((0, 0, -4), (0, 0, 0), width=160, height=160, fov_y=53.13)
     focal = 160 / (2 * view.tan_fov_y)
     return RasterInputs(view, splat.splats()), (focal * size / 4) ** 2 + 0.3
 
@@ -49,7 +50,7 @@ def test_a_quad_around_one_gaussian(viewer, opacity, squared):
 
 def test_tiles_of_the_host_are_those_of_the_oracle():
     splats = tiny.random_model(count=200).splats()
-    view = View.look_at((0, 0, -2.5), (0, 0, 0), width=96, height=64)
+    view = look_at((0, 0, -2.5), (0, 0, 0), width=96, height=64)
     inputs = RasterInputs(view, splats, planes=())
     out = ReferenceEngine().rasterize(inputs, None)
     host = BY_NAME["3DGS reference (CUDA)"]

@@ -11,7 +11,7 @@ import torch
 from cli.commands import fails, run_json
 from finetune import tiny
 
-from fragprune_plugins.files.ply import write_ply
+from fragprune_plugins.workbench.models.formats.ply import write_ply
 from fragprune_plugins.workbench.render import work
 from fragprune_plugins.workbench.render.filming import along, orbit, write_mp4
 from fragprune_plugins.workbench.scenes.generated import bounds

@@ -28,7 +28,7 @@ def test_the_target_is_in_the_middle_and_up_is_up(eye, target, up):
     way, over = torch.tensor(target) - torch.tensor(eye), torch.tensor(up)
     assume(float(torch.linalg.cross(way, over).norm()) > 0.1 * float(way.norm() * over.norm()))
     assume(float(way.norm()) > 0.1 and float(over.norm()) > 0.1)
-    view = fp.View.look_at(eye, target, up, width=40, height=30, fov_y=60)
+    view = fp.look_at(eye, target, up, width=40, height=30, fov_y=60)
     where, depth = pixel(view, target)
     assert torch.allclose(where, torch.zeros(2), atol=1e-3)
     assert depth == pytest.approx(float(way.norm()), rel=1e-3)
@@ -43,7 +43,7 @@ def test_the_target_is_in_the_middle_and_up_is_up(eye, target, up):
 
 
 def test_the_field_of_view_is_that_of_the_height():
-    view = fp.View.look_at((0, 0, -1), (0, 0, 0), width=200, height=100, fov_y=90)
+    view = fp.look_at((0, 0, -1), (0, 0, 0), width=200, height=100, fov_y=90)
     assert view.tan_fov_y == pytest.approx(1)
     assert view.tan_fov_x == pytest.approx(2)
     where, _ = pixel(view, (0.0, 1.0, 0.0))
@@ -64,7 +64,7 @@ def test_the_field_of_view_is_that_of_the_height():
 )
 def test_a_camera_that_sees_nothing_is_refused(changes):
     with pytest.raises(InputError):
-        fp.View.look_at(**({"eye": (0, 0, 0), "target": (0, 0, 1), "width": 8} | changes))
+        fp.look_at(**({"eye": (0, 0, 0), "target": (0, 0, 1), "width": 8} | changes))
 
 
 @pytest.mark.parametrize("up", [(0, -1, 0), (0, 0, 1), (0, 0, -3), (1, 1, 0)])

@@ -54,13 +54,13 @@ def draw_pair(
     """Both engines' outputs without gradients, and where their fragment counts agree, (H, W)."""
     truth = once(true_picture, inputs, thresholds)
     with torch.no_grad():
-        ours = engine.rasterize(inputs.with_counts(), thresholds)
+        ours = engine.rasterize(replace(inputs, counts=True), thresholds)
     return truth, ours, truth.fragments == ours.fragments
 
 
 @torch.no_grad()
 def true_picture(inputs: RasterInputs, thresholds: torch.Tensor | None) -> RasterOutputs:
-    wide = scenes.cast(inputs, torch.float64).with_counts()
+    wide = replace(scenes.cast(inputs, torch.float64), counts=True)
     return ReferenceEngine().rasterize(wide, None if thresholds is None else thresholds.double())
 
 

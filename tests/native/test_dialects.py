@@ -170,13 +170,13 @@ def test_footprints_draw_and_learn_what_the_splats_do(engine: CpuEngine, kind: d
     """Projected in torch, drawn by the engine, and back through both."""
     inputs = replace(dialect(2, **kind), absolute_gradient=True)
     thresholds = scenes.random_thresholds(2, 60)
-    whole = engine.rasterize(inputs.with_counts(), thresholds)
+    whole = engine.rasterize(replace(inputs, counts=True), thresholds)
     found = []
     for case in (inputs, scenes.cast(inputs, torch.float64)):
         made, leaves = scenes.leaves(case)
         leaves["thresholds"] = tau = thresholds.to(case.view.background).clone().requires_grad_()
         projected = made if case is inputs else footprints_of(made)
-        out = engine.rasterize(projected.with_counts(), tau)
+        out = engine.rasterize(replace(projected, counts=True), tau)
         same = whole.fragments == out.fragments
         assert (~same).sum() <= 2
         picture = torch.cat([out.image, out.invdepth, out.alpha])
@@ -201,7 +201,7 @@ def test_footprints_that_cannot_be_drawn_are_culled(engine: CpuEngine) -> None:
     splats.opacities[6] = math.nan
     splats.tiles[7] = torch.tensor([-(2**31), -5, 2**31 - 1, 2**31 - 1], dtype=torch.int32)
     made, leaves = scenes.leaves(scene)
-    drawn = engine.rasterize(made.with_counts(), None)
+    drawn = engine.rasterize(replace(made, counts=True), None)
     assert (drawn.fragments_per_gaussian > 0).tolist() == [False] * 7 + [True] * 2
     drawn.image.sum().backward()
     for name in ("means2d", "conics", "opacities", "colors"):
@@ -254,7 +254,7 @@ def test_mips_small_numbers_count_where_determinants_are_small(
     found = []
     for draws, case in ((engine, scene), (ReferenceEngine(), scenes.cast(scene, torch.float64))):
         made, leaves = scenes.leaves(case)
-        drawn = draws.rasterize(made.with_counts(), None)
+        drawn = draws.rasterize(replace(made, counts=True), None)
         assert (drawn.fragments.sum() > 0).item() is (side > 0.0316)
         drawn.image[:, 8, 8].sum().backward()
         alpha = drawn.alpha[0, 8, 8].item()

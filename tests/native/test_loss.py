@@ -11,9 +11,10 @@ from finetune.test_losses import plain_ssim
 
 from fragprune_plugins.engines import losses
 from fragprune_plugins.engines.cpu import binding
-from fragprune_plugins.engines.losses import compiled_loss, photometric_loss
+from fragprune_plugins.engines.losses import compiled_loss
 from fragprune_plugins.errors import EngineError, InputError
-from fragprune_plugins.learning.losses import ssim
+from fragprune_plugins.workbench.finetune import losses as trained
+from fragprune_plugins.workbench.finetune.losses import photometric_loss, ssim
 
 SIZES = [(1, 1), (1, 7), (5, 3), (11, 11), (26, 246), (9, 600), (129, 257)]
 """Smaller than the window, a panel to the pixel, and more than one panel and strip."""
@@ -175,7 +176,7 @@ def test_what_the_compiled_code_does_not_take_is_for_torch():
 def test_without_compiled_code_torch_does_it(monkeypatch):
     image, target = pair("smooth")
     monkeypatch.setenv(binding.ENVIRONMENT, "off")
-    assert losses.code_for(image.device) == "torch"
+    assert trained.code_for(image.device) == "torch"
     value, _ = oracle(image, target)
     assert float(photometric_loss(image, target)) == pytest.approx(float(value), abs=1e-6)
 
@@ -185,10 +186,10 @@ def test_fused_ssim_does_it_on_cuda_where_it_is_installed(monkeypatch):
     package.__spec__ = ModuleSpec("fused_ssim", None)
     package.fused_ssim = lambda x, y: ssim(*x, *y)  # of one image each
     monkeypatch.setitem(sys.modules, "fused_ssim", None)
-    assert losses.code_for(cuda) == "torch"
+    assert trained.code_for(cuda) == "torch"
     monkeypatch.setitem(sys.modules, "fused_ssim", package)
-    assert losses.code_for(cuda) == "fused-ssim"
-    monkeypatch.setattr(losses, "code_for", lambda _: "fused-ssim")
+    assert trained.code_for(cuda) == "fused-ssim"
+    monkeypatch.setattr(trained, "code_for", lambda _: "fused-ssim")
     image, target = pair("smooth")
     value, _ = oracle(image, target)
     assert float(photometric_loss(image, target)) == pytest.approx(float(value), abs=1e-6)

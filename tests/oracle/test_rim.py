@@ -15,7 +15,9 @@ SIZE = 33
 
 
 def draw(inputs, tau):
-    return rasterize(inputs.with_counts(), torch.tensor([tau], dtype=F64), engine="reference")
+    return rasterize(
+        replace(inputs, counts=True), torch.tensor([tau], dtype=F64), engine="reference"
+    )
 
 
 def ellipse(sigma, **kind):
@@ -56,7 +58,7 @@ def test_a_fragment_is_drawn_where_any_of_its_pixel_is_covered():
 
 def test_no_fragment_is_fainter_than_the_hosts_skip():
     inputs = replace(ellipse((5.0, 5.0)), rim="soft")
-    with_all = rasterize(inputs.with_counts(), None, engine="reference")
+    with_all = rasterize(replace(inputs, counts=True), None, engine="reference")
     assert torch.equal(draw(inputs, 1e-9).fragments, with_all.fragments)
     assert torch.equal(draw(inputs, 1e-9).image, with_all.image)
 

@@ -1,5 +1,7 @@
 """Thresholds: what they cut, what they must leave alone, and what gradient they get."""
 
+from dataclasses import replace
+
 import pytest
 import scenes
 import torch
@@ -22,7 +24,7 @@ def scene_of(seed, **kind):
 
 
 def draw(inputs, thresholds=None):
-    return rasterize(inputs.with_counts(), thresholds, engine="reference")
+    return rasterize(replace(inputs, counts=True), thresholds, engine="reference")
 
 
 def weights():

@@ -18,9 +18,10 @@ from typing import Any
 
 from fragprune_plugins.constants import VERSION
 from fragprune_plugins.errors import RecordError
-from fragprune_plugins.files.atomic import replacing, writable_folder
+from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.reading import MEBIBYTE, Door
 from fragprune_plugins.files.records import strict
+from fragprune_plugins.workbench.models.written import writable_folder
 
 RESULTS = (".md", ".csv", ".png")
 """Endings of the files that results are written to, after the experiment's name."""

@@ -19,6 +19,7 @@ from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
 from fragprune_plugins.plugins.hooks import schedule_for
 from fragprune_plugins.workbench.figures.evaluate import Candidate, frame_times, measure_all
 from fragprune_plugins.workbench.finetune.api import FinetuneResult, finetune
+from fragprune_plugins.workbench.finetune.resuming import described
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.pruning.scores import best
 from fragprune_plugins.workbench.scenes.dataset import Dataset, load_photographs
@@ -230,7 +231,7 @@ def _configuration(
             arm.label: {
                 "settings": {k: v for k, v in arm.settings.as_dict().items() if k != "seed"},
                 "rule": arm.rule and arm.rule.name,
-                "schedule": _schedule(arm, arm.settings).as_dict(),
+                "schedule": described(_schedule(arm, arm.settings)),
                 "start": arm.start and arm.start.name,
             }
             | ({"pruning": asdict(arm.pruning)} if arm.pruning else {})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -49,7 +50,7 @@ def _counted(
     package = host.render(camera, model)
     assert fixed.inputs is not None
     with torch.no_grad():
-        drawn = host.engine(tau.device).rasterize(fixed.inputs.with_counts(), tau)
+        drawn = host.engine(tau.device).rasterize(replace(fixed.inputs, counts=True), tau)
     return drawn, package["radii"]
 
 

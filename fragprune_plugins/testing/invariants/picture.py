@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -65,7 +67,9 @@ def _drawn_by(
         image = package["render"]
         with torch.no_grad():
             assert fixed.inputs is not None
-            drawn = host.engine(image.device).rasterize(fixed.inputs.with_counts(), store.values)
+            drawn = host.engine(image.device).rasterize(
+                replace(fixed.inputs, counts=True), store.values
+            )
         mask = torch.ones_like(drawn.fragments, dtype=torch.bool) if mask is None else mask
         weights = Chance(seed, 0.5).uniform(*image.shape) - 0.5
         (image * weights * mask).sum().backward()

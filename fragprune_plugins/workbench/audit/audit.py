@@ -23,10 +23,10 @@ from torch import Tensor
 from tqdm import tqdm
 
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.engines.reference import fragments
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.schedule import USUAL_STOP
 from fragprune_plugins.types import Splats, View, one_line
+from fragprune_plugins.workbench.audit.fragments import fragments
 from fragprune_plugins.workbench.figures.evaluate import Candidate, frame_times
 from fragprune_plugins.workbench.figures.extents import (
     CUTS,
@@ -343,7 +343,7 @@ def _candidates(model: Model, splats: Splats) -> dict[str, Candidate]:
         thresholds = thresholds if own is None else torch.maximum(own, thresholds)
         found[cut.name] = Candidate(model, cut=thresholds)
     if model.stop is None:
-        found[f"a stop at {USUAL_STOP:g}"] = Candidate(model.with_stop(USUAL_STOP))
+        found[f"a stop at {USUAL_STOP:g}"] = Candidate(model.with_rules(stop=USUAL_STOP))
     if model.pruned:
         found[UNTRUNCATED] = Candidate(model.untruncated())
     return found

@@ -22,6 +22,7 @@ from fragprune_plugins.engines import Engine
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.types import RasterInputs, Splats, View
 from fragprune_plugins.workbench.scenes.generated import Named, around, bounds, within
+from fragprune_plugins.workbench.scenes.pinhole import look_at
 
 Side = Literal["auto", "orbit", "inside"]
 """Where cameras go: ``auto`` chooses."""
@@ -181,7 +182,7 @@ def _faces(place: Tensor) -> Sequence[View]:
     """Six square views that together see everything."""
     eye = place.double().cpu()
     return [
-        View.look_at(
+        look_at(
             eye,
             eye + torch.tensor(ahead, dtype=torch.float64),
             width=_PIXELS,

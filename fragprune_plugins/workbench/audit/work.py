@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from fragprune_plugins.files.atomic import replacing, writable_folder
+from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.records import strict
 from fragprune_plugins.learning.stage2 import evenly
 from fragprune_plugins.workbench.audit import page
@@ -18,6 +18,7 @@ from fragprune_plugins.workbench.commands.opening import cameras_of, open_engine
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.figures.wording import nothing_drawn
 from fragprune_plugins.workbench.models.model import load
+from fragprune_plugins.workbench.models.written import writable_folder
 from fragprune_plugins.workbench.scenes.cameras import divided, load_cameras, load_scene_cameras
 
 PAGE, FIGURES = "audit.html", "audit.json"

@@ -7,7 +7,6 @@ from typing import Any
 
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files import records
-from fragprune_plugins.files.atomic import writable_folder
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.types import View
 from fragprune_plugins.workbench.commands.command import Report
@@ -29,6 +28,7 @@ from fragprune_plugins.workbench.figures.wording import (
     strangers,
 )
 from fragprune_plugins.workbench.models.model import load
+from fragprune_plugins.workbench.models.written import writable_folder
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
 from fragprune_plugins.workbench.scenes.output import trained_on
 

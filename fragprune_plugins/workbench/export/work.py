@@ -38,7 +38,7 @@ def export(
         require_place(out, given, thresholds=stop is not None or pruned is not None)
     splat = load(model, truncation=not no_truncation)
     splat = splat if pruned is None else _restored(splat, model, pruned)
-    splat = splat if stop is None else splat.with_stop(stop)
+    splat = splat if stop is None else splat.with_rules(stop=stop)
     if splat.pruned:
         formats.expect_carrier(form, out)
     dropped, lines, count = None, [], len(splat)

@@ -16,6 +16,7 @@ from fragprune_plugins.workbench.figures.drawing import rasterize
 from fragprune_plugins.workbench.figures.pictures import picture
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.scenes.generated import bounds
+from fragprune_plugins.workbench.scenes.pinhole import look_at
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -54,7 +55,7 @@ def overview(
     away = torch.nn.functional.normalize(0.4 * above - ahead, dim=0)
     distance = radius / math.sin(half)
     eye = centre + distance * away
-    return View.look_at(eye, centre, up, width=width, height=height, fov_y=fov_y)
+    return look_at(eye, centre, up, width=width, height=height, fov_y=fov_y)
 
 
 def render_view(

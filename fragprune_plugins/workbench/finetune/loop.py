@@ -15,7 +15,6 @@ from torch import Tensor
 from tqdm import tqdm
 
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.engines.losses import photometric_loss
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.adam import make_adam
 from fragprune_plugins.learning.area import area_per_pixel
@@ -29,6 +28,7 @@ from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.hooks import thresholds_for
 from fragprune_plugins.plugins.loading import installed
 from fragprune_plugins.types import RasterInputs, RasterOutputs
+from fragprune_plugins.workbench.finetune.losses import photometric_loss
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 
 # Learning rates at the start of stage 2, the hosts' own; all decay with the opacity's. Positions

@@ -15,11 +15,11 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.constants import VERSION
-from fragprune_plugins.engines.losses import code_for
 from fragprune_plugins.errors import CheckpointError, OutputError
 from fragprune_plugins.files.atomic import digest
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.events import StepStats
+from fragprune_plugins.learning.plain import numbers_of
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.hooks import schedule_for
@@ -27,6 +27,7 @@ from fragprune_plugins.plugins.loading import installed
 from fragprune_plugins.workbench.finetune import checkpoints
 from fragprune_plugins.workbench.finetune.checkpoints import UNFIT
 from fragprune_plugins.workbench.finetune.loop import Training
+from fragprune_plugins.workbench.finetune.losses import code_for
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Photograph, Shot
 from fragprune_plugins.workbench.scenes.images import DOOR
 
@@ -248,9 +249,19 @@ def configuration(
         "photographs": _digest(each for shot in shots for each in _of(shot)),
         "engine": engine,
         "plugins": deciding(),
-        "schedule": (schedule or schedule_for(settings)).as_dict(),
+        "schedule": described(schedule or schedule_for(settings)),
         "device": model.device.type,
         **settings.as_dict(),
+    }
+
+
+def described(schedule: Schedule) -> dict[str, Any]:
+    """What decides beside the settings: a schedule's numbers and its pressure's."""
+    pressure = schedule.make_pressure()
+    return {
+        "kind": type(schedule).__qualname__,
+        **numbers_of(schedule),
+        "pressure": {"kind": type(pressure).__qualname__, **numbers_of(pressure)},
     }
 
 

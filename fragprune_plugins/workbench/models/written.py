@@ -1,13 +1,34 @@
-"""Where a model is to be written, and what a person is told of the file."""
+"""Where a result is to be written, and what a person is told of the file."""
 
 from __future__ import annotations
 
 import os
+import tempfile
 from pathlib import Path
 
 from fragprune_plugins.errors import OutputError, UsageError
-from fragprune_plugins.files.atomic import writable_folder
 from fragprune_plugins.workbench.models import formats
+
+
+def writable_folder(path: Path) -> Path:
+    """Create the folder if it is missing, and check that a file can be made in it; returns it.
+
+    Raises:
+        OutputError: the folder cannot be written.
+    """
+    path = Path(path)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OSError as error:
+        raise OutputError(
+            str(path),
+            f"cannot be written ({error.strerror or error})",
+            "a folder one can write to",
+            "Choose another output folder.",
+        ) from error
+    return path
 
 
 def require_place(out: Path, model: Path, *, thresholds: bool = True) -> None:

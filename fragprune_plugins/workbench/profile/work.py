@@ -7,7 +7,6 @@ from typing import Any
 
 import torch
 
-from fragprune_plugins.files.atomic import writable_folder
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import (
     chosen,
@@ -20,6 +19,7 @@ from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
 from fragprune_plugins.workbench.figures.panels import leave_panels
 from fragprune_plugins.workbench.figures.wording import PROFILED, describe, nothing_drawn
 from fragprune_plugins.workbench.models.model import load
+from fragprune_plugins.workbench.models.written import writable_folder
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
 
 

@@ -20,6 +20,7 @@ from fragprune_plugins.files.model import Model
 from fragprune_plugins.types import View
 from fragprune_plugins.workbench.figures.viewing import overview
 from fragprune_plugins.workbench.scenes.generated import Named, bounds, interpolate
+from fragprune_plugins.workbench.scenes.pinhole import look_at
 
 _PICTURE: dict[str, Any] = {"width": 1280, "height": 720, "fov_y": 50.0}
 
@@ -46,7 +47,7 @@ def orbit(
     for number in range(count):
         turn = Rotation.from_rotvec((2 * math.pi * number / count * axis).numpy())
         eye = centre.double() + torch.from_numpy(turn.apply(away.numpy()))
-        view = View.look_at(eye.float(), centre, up, **_PICTURE)
+        view = look_at(eye.float(), centre, up, **_PICTURE)
         views.append((f"orbit{number:04d}", view))
     return views
 

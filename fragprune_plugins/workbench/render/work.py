@@ -14,7 +14,6 @@ from tqdm import tqdm
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.files.atomic import writable_folder
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.plugins.hooks import thresholds_for
 from fragprune_plugins.types import RasterInputs, RasterOutputs
@@ -35,6 +34,7 @@ from fragprune_plugins.workbench.distributed.sharded import ShardedEngine
 from fragprune_plugins.workbench.figures.pictures import save_image, stems
 from fragprune_plugins.workbench.figures.wording import nothing_drawn
 from fragprune_plugins.workbench.models.model import load
+from fragprune_plugins.workbench.models.written import writable_folder
 from fragprune_plugins.workbench.ranks import Ranks, joined
 from fragprune_plugins.workbench.render import filming
 from fragprune_plugins.workbench.scenes.cameras import divided, load_cameras

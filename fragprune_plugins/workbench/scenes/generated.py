@@ -20,6 +20,7 @@ from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.types import View
 from fragprune_plugins.workbench.scenes.dataset import Shot
+from fragprune_plugins.workbench.scenes.pinhole import look_at
 from fragprune_plugins.workbench.scenes.posed import HOLD_OUT
 
 Named = list[tuple[str, View]]
@@ -82,9 +83,7 @@ def around(
         away = torch.tensor([level * math.cos(turn), rise, level * math.sin(turn)])
         far = radius / math.sin(math.radians(_FOV) / 2) * stream.uniform(*_NEARER)
         eye = centre + far * away
-        view = View.look_at(
-            eye, centre, width=pixels, height=pixels, fov_y=_FOV, background=background
-        )
+        view = look_at(eye, centre, width=pixels, height=pixels, fov_y=_FOV, background=background)
         views.append((f"around{number:03d}", view))
     return views
 
@@ -102,7 +101,7 @@ def within(places: Sequence[Tensor], count: int, *, pixels: int = 800) -> Named:
         level = math.sqrt(1 - rise * rise)
         ahead = torch.tensor([level * math.cos(turn), rise, level * math.sin(turn)])
         eye = places[number % len(places)].detach().float().cpu()
-        view = View.look_at(eye, eye + ahead, width=pixels, height=pixels, fov_y=_WIDE)
+        view = look_at(eye, eye + ahead, width=pixels, height=pixels, fov_y=_WIDE)
         views.append((f"within{number:03d}", view))
     return views
 

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import torch
 from torch import Tensor
 
-from fragprune_plugins.constants import DISTANCE_MAX, ROTATION_TOLERANCE
 from fragprune_plugins.errors import InputError
-from fragprune_plugins.types import View, check_lens, one_line, require_tensor
+from fragprune_plugins.types import View, check_lens, check_tensor, one_line, require_tensor
+
+ROTATION_TOLERANCE: Final = 1e-2
+"""Most that R R^T of a camera's rotation differs from 1; matrices come rounded to a few digits."""
+
+DISTANCE_MAX: Final = 1e12
+"""Most world units of a camera from the origin: float32 holds its square with room to spare."""
 
 
 @dataclass(frozen=True)
@@ -96,3 +104,55 @@ def check_pose(rotation: Tensor, translation: Tensor) -> None:
     if not float(translation.detach().abs().max()) <= DISTANCE_MAX:
         expected = f"finite, at most {DISTANCE_MAX:g} world units"
         raise InputError("translation", f"{translation.tolist()}", expected, "Check the camera.")
+
+
+def look_at(
+    eye: Sequence[float] | Tensor,
+    target: Sequence[float] | Tensor,
+    up: Sequence[float] | Tensor = (0.0, -1.0, 0.0),
+    *,
+    width: int = 960,
+    height: int = 720,
+    fov_y: float = 50.0,
+    background: Tensor | None = None,
+) -> View:
+    """A camera at a place that looks at another; on the CPU, float32.
+
+    Args:
+        eye: (3,) camera centre in the world.
+        target: (3,) what is in the middle of the picture.
+        up: (3,) what is up in the picture, of any length; COLMAP's worlds have y down.
+        width: pixels.
+        height: pixels.
+        fov_y: vertical field of view, degrees in (0, 180).
+        background: (3,) RGB; black when None.
+
+    Raises:
+        InputError: eye equals target, it looks straight up or down, or fov_y is not in
+            (0, 180).
+    """
+    at, to, over = (torch.as_tensor(p, dtype=torch.float64).cpu() for p in (eye, target, up))
+    for name, point in (("eye", at), ("target", to), ("up", over)):
+        check_tensor(f"look_at {name}", point, 3)
+    forward = torch.nn.functional.normalize(to - at, dim=0)
+    right = torch.linalg.cross(forward, over)
+    straight = float(right.norm()) > 1e-6 * float(over.norm())  # False for NaN, too
+    if not straight or not 0 < fov_y < 180:
+        raise InputError(
+            "look_at",
+            f"eye {at.tolist()}, target {to.tolist()}, up {over.tolist()}, fov_y {fov_y:g}",
+            "a target apart from the eye, up not along the way there, and fov_y in (0, 180)",
+            "Move one of them.",
+        )
+    right = torch.nn.functional.normalize(right, dim=0)
+    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    focal = height / (2 * math.tan(math.radians(fov_y) / 2))
+    return View.pinhole(
+        rotation.float(),
+        (-rotation @ at).float(),
+        width=width,
+        height=height,
+        fx=focal,
+        fy=focal,
+        background=background,
+    )

@@ -15,11 +15,12 @@ from typing import Any
 import torch
 
 from fragprune_plugins.errors import OutputError
-from fragprune_plugins.files.atomic import replacing, writable_folder
+from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.types import View
 from fragprune_plugins.workbench.figures.page import allowed
 from fragprune_plugins.workbench.figures.pictures import picture
+from fragprune_plugins.workbench.models.written import writable_folder
 from fragprune_plugins.workbench.scenes.dataset import Shot
 from fragprune_plugins.workbench.scenes.generated import bounds
 from fragprune_plugins.workbench.view.compact import compact

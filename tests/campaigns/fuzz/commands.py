@@ -15,8 +15,8 @@ from finetune import tiny
 
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.files.ply import write_ply
 from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.workbench.models.formats.ply import write_ply
 
 SURFACES = {
     "model.ply": ("render", "export"),

@@ -20,10 +20,10 @@ from PIL import Image
 from plyfile import PlyData
 
 from fragprune_plugins.files import records, sidecar
-from fragprune_plugins.files.ply import write_ply
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.workbench.finetune import checkpoints
 from fragprune_plugins.workbench.models import formats
+from fragprune_plugins.workbench.models.formats.ply import write_ply
 from fragprune_plugins.workbench.models.formats.spz import zstd
 
 CORPUS = Path(__file__).parent / "corpus"

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fragprune_plugins.files.atomic import replacing, writable_folder
+from fragprune_plugins.files.atomic import replacing
+from fragprune_plugins.workbench.models.written import writable_folder
 from lab.room.furniture import CENTRE, furnish
 from lab.room.textures import displayed
 from lab.room.tracer import FAR, Array, World, times

@@ -143,7 +143,7 @@ def write(form: Format, new: Path, model: Model) -> None:
     Raises:
         OutputError: the format cannot hold the model or its thresholds.
     """
-    from fragprune_plugins.files.ply import write_ply
+    from fragprune_plugins.workbench.models.formats.ply import write_ply
 
     if model.pruned:
         expect_carrier(form, new)

@@ -1,0 +1,58 @@
+"""The photometric loss by the fastest code that is here for where the images are."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from fragprune_plugins.engines.cpu import binding
+from fragprune_plugins.engines.losses import compiled_loss
+from fragprune_plugins.learning.losses import SSIM_WEIGHT, ssim_map
+
+Code = Literal["cpu", "fused-ssim", "torch"]
+"""Who computes a loss. Results differ in their last bits."""
+
+
+def code_for(device: torch.device) -> Code:
+    """Who computes the loss of float32 images on a device."""
+    if device.type == "cpu" and binding.available():
+        return "cpu"
+    if device.type == "cuda" and find_spec("fused_ssim") is not None:
+        return "fused-ssim"
+    return "torch"
+
+
+def photometric_loss(image: Tensor, target: Tensor) -> Tensor:
+    """0.8 L1 + 0.2 (1 - SSIM) of two images (C, H, W); differentiable.
+
+    The compiled code and fused-ssim take float32 images, and give a gradient by the first alone;
+    torch does what they do not.
+    """
+    usual = image.dtype == target.dtype == torch.float32 and not target.requires_grad
+    code = code_for(image.device) if usual and image.device == target.device else "torch"
+    if code == "cpu":
+        return compiled_loss(image, target)
+    if code == "fused-ssim":
+        from fused_ssim import fused_ssim
+
+        similar: Tensor = fused_ssim(image[None], target[None])
+        return (1 - SSIM_WEIGHT) * l1(image, target) + SSIM_WEIGHT * (1 - similar)
+    return torch_loss(image, target)
+
+
+def torch_loss(image: Tensor, target: Tensor) -> Tensor:
+    """0.8 L1 + 0.2 (1 - SSIM) of two images (3, H, W), by torch, of any dtype and on any device."""
+    return (1 - SSIM_WEIGHT) * l1(image, target) + SSIM_WEIGHT * (1 - ssim(image, target))
+
+
+def l1(image: Tensor, target: Tensor) -> Tensor:
+    """Mean absolute difference of two images (3, H, W)."""
+    return (image - target).abs().mean()
+
+
+def ssim(image: Tensor, target: Tensor) -> Tensor:
+    """Mean structural similarity of two images (C, H, W) in [0, 1]; see ``ssim_map``."""
+    return ssim_map(image, target).mean()
