@@ -85,15 +85,10 @@ def _zero(*_: Any, **__: Any) -> int:
 
 _SUBSTITUTES: dict[str, Any] = {
     "Event": _Event,
-    "set_device": _nothing,
-    "synchronize": _nothing,
-    "empty_cache": _nothing,
-    "reset_peak_memory_stats": _nothing,
-    "reset_max_memory_allocated": _nothing,
+    **dict.fromkeys(("set_device", "synchronize", "empty_cache"), _nothing),
+    **dict.fromkeys(("reset_peak_memory_stats", "reset_max_memory_allocated"), _nothing),
+    **dict.fromkeys(("memory_allocated", "max_memory_allocated", "memory_reserved"), _zero),
     "current_device": _zero,
-    "memory_allocated": _zero,
-    "max_memory_allocated": _zero,
-    "memory_reserved": _zero,
     "FloatTensor": torch.FloatTensor,
     "IntTensor": torch.IntTensor,
 }

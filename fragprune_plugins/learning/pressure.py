@@ -134,13 +134,12 @@ class StepViews:
         self.expected = self.drawn or self.expected
         self._rows = []
 
-    def draw(self, fragments: Figure, untruncated: Figure, pressed: Figure | None = None) -> None:
+    def draw(self, fragments: Figure, untruncated: Figure, pressed: Figure) -> None:
         """Note a view drawn with gradients: its fragments per pixel now and before learning.
 
         Args:
-            pressed: what the pressure acts on; the fragments when None.
+            pressed: what the pressure acts on.
         """
-        pressed = fragments if pressed is None else pressed
         self._rows.append([fragments, untruncated, pressed])  # the loss comes later
 
     def lose(self, loss: Figure) -> None:
@@ -157,29 +156,15 @@ class StepViews:
         """Number of views so far."""
         return len(self._rows)
 
-    @property
-    def fragments(self) -> float:
-        """Fragments per pixel, mean over the views so far."""
-        return self._mean(0)
-
-    @property
-    def untruncated(self) -> float:
-        """Fragments per pixel before learning, mean over the views so far."""
-        return self._mean(1)
-
-    @property
-    def pressed(self) -> float:
-        """What the pressure acts on, mean over the views so far."""
-        return self._mean(2)
+    def means(self) -> tuple[float, ...]:
+        """Of fragments, untruncated and pressed, over the views so far."""
+        return tuple(sum(column) / self.drawn for column in zip(*self.rows(), strict=True))[:3]
 
     @property
     def loss(self) -> float:
         """Sum of the known losses of the views so far; NaN if none is known."""
         known = [float(row[3]) for row in self._rows if len(row) > 3]
         return sum(known) if known else math.nan
-
-    def _mean(self, column: int) -> float:
-        return sum(float(row[column]) for row in self._rows) / len(self._rows)
 
 
 class PressureController:

@@ -124,7 +124,6 @@ class Stage2:
         # by picture: fragments per pixel
         self._before: dict[_Picture, Tensor] = {}
         self._after: dict[_Picture, Tensor] = {}
-        self._pictures: list[_Picture] = []  # of this step
         self._views = StepViews(settings.views_per_step)
         self._median = math.nan
 
@@ -161,7 +160,6 @@ class Stage2:
         self.steps += 1
         self.plan = self.schedule.at(self.steps)
         self._views.begin()
-        self._pictures = []
         self._open |= self.plan.learn
         if self.plan.counted:
             self.store.ruled(stop=self.settings.stop_of(self.store.stop), rim=self.settings.rim)
@@ -236,7 +234,6 @@ class Stage2:
             self._after[picture] = drawn
         if not counted:
             return None
-        self._pictures.append(picture)
         pressed = outputs.fragments_per_pixel if area is None else area
         self._views.draw(drawn[0], self._before[picture][0], pressed.detach())
         if not self.learning or self.pressure.value == 0:
@@ -309,18 +306,19 @@ class Stage2:
         every = max(1, self.settings.iterations // CURVE_POINTS)
         if math.isnan(self._median) or self.steps % every == 0:
             self._median = float(self._everywhere(self.store.values.detach()).median())
+        fragments, untruncated, pressed = views.means()
         stats = StepStats(
             step=self.steps,
-            fragments_per_pixel=views.fragments,
+            fragments_per_pixel=fragments,
             pressure=self.pressure.value,
             threshold_median=self._median,
             loss=views.loss,
         )
         if self.learning:
-            ratio = max(views.untruncated, 1e-9) / max(views.pressed, 1e-9)
+            ratio = max(untruncated, 1e-9) / max(pressed, 1e-9)
             if self.target is not None:
                 ratio = self.target.followed(ratio)
-            self.pressure.observe(Observation(plan.progress, views.pressed, ratio, views.loss))
+            self.pressure.observe(Observation(plan.progress, pressed, ratio, stats.loss))
         views.begin()  # first, so that whoever watches may raise
         if self._watch is not None:
             self._watch(stats)

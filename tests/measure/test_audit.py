@@ -10,6 +10,7 @@ from finetune import tiny
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fragprune_plugins.engines.fragments import fragments
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins.hooks import engine_for
@@ -24,7 +25,6 @@ from fragprune_plugins.workbench.audit.audit import (
     audit,
     weigh,
 )
-from fragprune_plugins.workbench.audit.fragments import fragments
 from reference_renderer.composite import transmittances
 
 ENGINE = engine_for("auto", "cpu")

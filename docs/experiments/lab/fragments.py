@@ -14,9 +14,9 @@ from torch import Tensor
 
 from fragprune_plugins.constants import ALPHA_MIN
 from fragprune_plugins.engines import Engine
+from fragprune_plugins.engines.fragments import fragments
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.types import RasterInputs
-from fragprune_plugins.workbench.audit.fragments import fragments
 from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.figures.pictures import COLOURS, LABEL
 from fragprune_plugins.workbench.scenes.dataset import Shot, load_photographs

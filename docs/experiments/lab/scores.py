@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.engines import Engine
+from fragprune_plugins.engines.fragments import fragments
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.types import RasterInputs, RasterOutputs, View
-from fragprune_plugins.workbench.audit.fragments import fragments
 from fragprune_plugins.workbench.pruning.scores import Score, removal_error
 
 VOLUME_POWER = 0.1

@@ -300,23 +300,6 @@ def library() -> Library:
     )
 
 
-class State:
-    """Owns a fragprune_state, the data that backward needs; frees it with the last reference.
-
-    Attributes:
-        handle: the C pointer; None until forward has filled it.
-    """
-
-    def __init__(self, opened: Library) -> None:
-        self._free = opened.calls.fragprune_free
-        self.handle: int | None = None
-
-    def __del__(self) -> None:
-        if self.handle is not None:
-            self._free(self.handle)
-            self.handle = None
-
-
 class Workspace:
     """Owns a fragprune_workspace: memory that calls reuse. Any thread may use it.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import weakref
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -33,7 +34,8 @@ class _Drawing:
 
     Attributes:
         arrays: the tensors that C code reads; they live as long as its state.
-        state: the data that backward needs; None if no gradients are needed.
+        state: the address of the data that backward needs, which are freed with the drawing; None
+            if no gradients are needed.
         evaluated: (Gaussian, pixel) lanes that were computed.
         entries: (Gaussian, tile) pairs that were blended.
         stages: milliseconds by stage.
@@ -43,7 +45,7 @@ class _Drawing:
     library: binding.Library
     workspace: binding.Workspace
     arrays: dict[str, Tensor]
-    state: binding.State | None = None
+    state: int | None = None
     evaluated: int = 0
     entries: int = 0
     stages: dict[str, float] = field(default_factory=dict)
@@ -89,8 +91,9 @@ class _Drawing:
         )
         expect_ok(status, error)
         if wanted:
-            self.state = binding.State(self.library)
-            self.state.handle = handle.value
+            self.state = handle.value
+            free = self.library.calls.fragprune_free
+            weakref.finalize(self, free, handle.value).atexit = False
         else:
             self.arrays = {}
         self.evaluated, self.entries = outputs.evaluated, outputs.entries
@@ -112,7 +115,7 @@ class _Drawing:
         grads = {name: empty(self.workspace, *shapes[name]) for name in wanted}
         error = binding.Error()
         status = self.library.calls.fragprune_backward(
-            self.state.handle,
+            self.state,
             ctypes.byref(output_grads),
             ctypes.byref(binding.InputGrads(**{k: address(g) for k, g in grads.items()})),
             native_threads(),

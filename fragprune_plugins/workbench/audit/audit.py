@@ -23,10 +23,10 @@ from torch import Tensor
 from tqdm import tqdm
 
 from fragprune_plugins.engines import Engine
+from fragprune_plugins.engines.fragments import fragments
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.schedule import USUAL_STOP
 from fragprune_plugins.types import Splats, View, one_line
-from fragprune_plugins.workbench.audit.fragments import fragments
 from fragprune_plugins.workbench.figures.evaluate import Candidate, frame_times
 from fragprune_plugins.workbench.figures.extents import (
     CUTS,

@@ -39,8 +39,8 @@ class SharedStage(Stage2):
             for picture in list(known)[count:]:  # the order of what is new must be the same
                 del known[picture]
         self._views = StepViews(self._views.expected)
-        self._pictures = [(view, 0) for view in views]
-        for picture, (drawn, before, pressed, loss) in zip(self._pictures, figures, strict=True):
+        for view, (drawn, before, pressed, loss) in zip(views, figures, strict=True):
+            picture = view, 0
             self._before.setdefault(picture, before.reshape(1))
             if self._open:
                 self._after[picture] = drawn.reshape(1)

@@ -1,4 +1,4 @@
-"""The fragments themselves, as the oracle draws them."""
+"""The fragments themselves, as the oracle draws them: for audits, and no host needs them."""
 
 from __future__ import annotations
 
