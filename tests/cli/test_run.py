@@ -85,6 +85,45 @@ def test_the_host_and_the_engine_take_as_many_threads_as_they_are_given(
     assert threads == [1, 3]
 
 
+@pytest.mark.parametrize(
+    ("name", "beside", "shown"),
+    [
+        ("point_cloud.ply", (), True),
+        ("point_cloud.ply", ("deformation.pth",), False),  # 4DGaussians
+        ("chkpnt16.pth", (), False),  # RT-4DGS
+    ],
+)
+def test_a_page_is_advised_only_of_a_model_that_view_shows(
+    name, beside, shown, trained, tmp_path, monkeypatch
+):
+    _, found, _ = trained
+    model = tmp_path / name
+    shutil.copy(found["model_before"], model)
+    for each in beside:
+        (tmp_path / each).touch()
+    summary = launch.RunSummary(
+        adapter="a host",
+        engine="cpu",
+        device="cpu",
+        stage="finetune",
+        iterations=6,
+        gaussians=found["gaussians"],
+        fragments_before=2.0,
+        fragments_after=1.0,
+        model_before=None,
+        model_after=model,
+        train_seconds=1.0,
+        target_reached=None,
+        curves=[],
+        settings=found["settings"],
+        output=tmp_path,
+    )
+    monkeypatch.setattr(launch, "run", lambda *_: summary)
+    said = run("run", "--", HOST / "train.py").stdout
+    assert (f"fragprune view {model}" in said) == shown
+    assert f"fragprune report {tmp_path}" in said
+
+
 def test_a_control_lies_beside_the_result_and_is_quoted_with_it(folder):
     out, scene = folder
     finetune = ["--stage", "finetune", *WORDS]

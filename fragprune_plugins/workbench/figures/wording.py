@@ -209,13 +209,15 @@ def _by_pruning(before: dict[str, Any], after: dict[str, Any], control: dict[str
     return gained - without
 
 
-def next_steps(model: Path, folder: Path, scene: Path | None = None) -> str:
+def next_steps(model: Path | None, folder: Path, scene: Path | None = None) -> str:
     """A line on what to do with a model that a command wrote, and with the record in a folder.
 
-    ``scene`` is the folder of its photographs: elsewhere, ``report`` reads it only by name.
+    ``model`` is None if ``view`` does not show it. ``scene`` is the folder of its photographs:
+    elsewhere, ``report`` reads it only by name.
     """
+    look = f"Look at it: fragprune view {model}. " if model else ""
     data = "" if scene is None or lies_in(scene, folder) else f" --data {scene}"
-    return f"Look at it: fragprune view {model}. A page to share: fragprune report {folder}{data}"
+    return f"{look}A page to share: fragprune report {folder}{data}"
 
 
 def missed(data: dict[str, Any]) -> str:

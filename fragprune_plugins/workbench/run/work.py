@@ -202,5 +202,15 @@ def _describe(
     )
     if summary.model_after and summary.output:
         scene = summary.photographs.folder if summary.photographs else None
-        lines.append(next_steps(summary.model_after, summary.output, scene))
+        shown = summary.model_after if _viewable(summary.model_after) else None
+        lines.append(next_steps(shown, summary.output, scene))
     return "\n".join(lines)
+
+
+def _viewable(model: Path) -> bool:
+    """Whether the file alone shows what its host draws, so that ``fragprune view`` takes it."""
+    try:
+        load(model)
+    except FragpruneError:
+        return False
+    return True
