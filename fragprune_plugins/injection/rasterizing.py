@@ -264,12 +264,13 @@ def rasterize(
     part: int = 0,
 ) -> RasterOutputs:
     """Draw with thresholds (N,) or without; while learning, add the pressure to the loss."""
-    outputs = engine.rasterize(inputs, thresholds)
     if state.stage is None:
-        return outputs
+        return engine.rasterize(inputs, thresholds)
+    shown = state.stage.dropped(inputs)
+    outputs = engine.rasterize(shown, thresholds)
 
     def untruncated() -> RasterOutputs:
-        if thresholds is None and inputs.stop is None:
+        if thresholds is None and inputs.stop is None and shown is inputs:
             return outputs
         return engine.rasterize(replace(inputs, stop=None), None)
 

@@ -64,6 +64,9 @@ class Settings:
             learn from photographs and the model has no stop of its own. None adds none.
         rim: how thresholds cut, "hard" or "soft", see ``RasterInputs``; None keeps what the model
             has.
+        dropout: the share of Gaussians that a step leaves out at first, 0 to below 1, see
+            ``Stage2.dropped``; it falls to nothing over the run. None is none, unless the driver
+            finds out that the model needs some.
         seed: of the order of views in ``finetune``; hosts have their own.
         views_per_step: that ``finetune`` draws in each step, whose loss is their mean; hosts have
             their own.
@@ -80,6 +83,7 @@ class Settings:
     itself: bool = False
     stop: float | Literal["auto"] | None = "auto"
     rim: Rim | None = None
+    dropout: float | None = None
     seed: int = 0
     views_per_step: int = 1
 
@@ -99,6 +103,7 @@ class Settings:
             ("itself", lambda value: isinstance(value, bool), "True or False"),
             ("stop", _is_stop, "1e-4 to 1, a share of a pixel's light, 'auto' or None"),
             ("rim", (None, *get_args(Rim)).__contains__, "hard, soft or None"),
+            ("dropout", lambda value: value is None or (rate(value) and value < 1), "0 to below 1"),
             ("seed", lambda value: type(value) is int, "a whole number"),
             ("views_per_step", whole(1, ITERATIONS_MAX), "a whole number, 1 or more"),
         )

@@ -5,6 +5,7 @@ optimizer of everything but the thresholds, tells it what happens, in this order
 
     begin       the step is counted and planned; new thresholds open; a due target is met
     thresholds  what one rasterization is drawn with
+    dropped     a picture to learn from, without some of its Gaussians, if the settings say so
     drew        what came of it; the fragment pressure, a term for the driver's loss, comes back
     lost        the loss of the view drawn last went backward
     expect_sound  its gradients must be finite, before the driver's optimizer steps
@@ -22,6 +23,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, TypeVar
 
@@ -51,6 +53,9 @@ RESET, MOSTLY = 0.0101, 0.9
 
 LOOKED_AT_EVERY = 10
 """Steps from one look at all parameters to the next: a look reads all of them."""
+
+OPAQUE = 0.999
+"""Most that an opacity becomes to make up for Gaussians that a step leaves out."""
 
 CURVE_POINTS = 100
 """Thresholds' median, a sort of all rows, is taken this often in a run."""
@@ -203,6 +208,25 @@ class Stage2:
         if values is None or self.plan is None or self.learning:
             return values
         return values.detach()
+
+    def dropped(self, inputs: RasterInputs) -> RasterInputs:
+        """A picture to learn from, without a random share of its Gaussians (``Settings.dropout``).
+
+        The others are the more opaque, so that a pixel keeps its light in the mean. A model that
+        knows its photographs by heart then learns what holds without any single Gaussian
+        (DropGaussian, CVPR 2025). The share falls to nothing over the run. Pictures without a
+        gradient are whole; the global random streams are not touched.
+        """
+        share = 0.0 if self.plan is None else 1 - self.plan.progress
+        share *= self.settings.dropout or 0.0
+        if share == 0 or not torch.is_grad_enabled():
+            return inputs
+        opacities = inputs.splats.opacities
+        stream = torch.Generator().manual_seed(hash((self.settings.seed, self.steps)))
+        kept = torch.rand(len(opacities), generator=stream).to(opacities.device) >= share
+        more = (opacities / (1 - share)).clamp(max=OPAQUE)
+        splats = replace(inputs.splats, opacities=torch.where(kept, more, 0.0))
+        return replace(inputs, splats=splats)
 
     def drew(
         self,

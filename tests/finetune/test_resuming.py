@@ -54,11 +54,12 @@ def require_same(one, other):
     [
         Settings(iterations=STEPS),
         Settings(iterations=STEPS, train="opacity", goal=Pressure(1e-3)),
+        Settings(iterations=STEPS, dropout=0.2),
         Settings(iterations=STEPS, train="appearance", goal=Fewer(1.5)),
         Settings(iterations=STEPS, goal=Control(), seed=3),
         Settings(iterations=STEPS, goal=Portable()),
     ],
-    ids=["all", "opacity", "target", "control", "portable"],
+    ids=["all", "opacity", "dropout", "target", "control", "portable"],
 )
 def test_cut_off_again_and_again_it_ends_as_if_never_cut(
     model, dataset, tmp_path, monkeypatch, single_thread, settings

@@ -58,6 +58,7 @@ CASES = {
     "default": Settings(iterations=STEPS, train="opacity"),
     "pressure": Settings(iterations=STEPS, goal=Pressure(2e-3), train="opacity"),
     "target": Settings(iterations=STEPS, goal=Fewer(1.5), train="opacity"),
+    "dropout": Settings(iterations=STEPS, goal=Pressure(2e-3), train="opacity", dropout=0.2),
     "appearance": Settings(iterations=STEPS, train="appearance"),
     "control": Settings(iterations=STEPS, goal=Control(), train="opacity"),
     "a schedule of one's own": Settings(iterations=STEPS, goal=Pressure(1e-3), train="appearance"),

@@ -23,9 +23,8 @@ from fragprune_plugins.workbench.models import formats
     help="File to write; its suffix names the format: " + ", ".join(formats.SUFFIXES) + ".",
 )
 @click.option(
-    "--drop-invisible",
-    "drop",
-    is_flag=True,
+    "--keep",
+    type=click.Choice(["visible"]),
     help="Leave out Gaussians that no view can draw, with an opacity below 1/255.",
 )
 @click.option(

@@ -27,7 +27,7 @@ def export(
     *,
     model: Path,
     out: Path,
-    drop: bool,
+    keep: str | None,
     stop: float | None,
     pruned: Path | None,
     no_truncation: bool,
@@ -43,7 +43,7 @@ def export(
         formats.expect_carrier(form, out)
     dropped, lines, count = None, [], len(splat)
     save(out, splat)
-    if drop:
+    if keep == "visible":
         size, splat = out.stat().st_size, splat.keep(visible(splat))
         save(out, splat)
         dropped = dropping(out, size, count, len(splat))

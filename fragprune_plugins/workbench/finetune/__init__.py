@@ -33,18 +33,19 @@ from fragprune_plugins.workbench.ranks import launched
 
 def _share(
     ctx: click.Context, param: click.Parameter, value: str | None
-) -> float | Literal["auto"] | None:
-    """A share in (0, 1], or auto."""
+) -> float | Literal["auto", "visible"] | None:
+    """A share in (0, 1], or a word."""
     if value is None:
         return None
-    if value == "auto":
-        return "auto"
+    words: dict[str, Literal["auto", "visible"]] = {"auto": "auto", "visible": "visible"}
+    if value in words:
+        return words[value]
     try:
         share = float(value)
     except ValueError:
         share = 0.0
     if not 0 < share <= 1:
-        raise click.BadParameter(f"{value!r} is neither auto nor a number with 0 < X <= 1.")
+        raise click.BadParameter(f"{value!r} is not auto, visible or a number with 0 < X <= 1.")
     return share
 
 
@@ -78,7 +79,7 @@ RULES = (
     ),
     Alone(("--self 1", "--keep auto"), "photographs, whose error says what can be spared"),
     *apart("--shard-gaussians", "--self", "--portable", expected=_PARTS),
-    *apart("--shard-gaussians", "--max-drop", "--keep", "--drop-invisible", expected=_PARTS),
+    *apart("--shard-gaussians", "--max-drop", "--keep", expected=_PARTS),
 )
 
 
@@ -114,11 +115,11 @@ RULES = (
 @config_option
 @click.option(
     "--keep",
-    metavar="SHARE|auto",
+    metavar="SHARE|auto|visible",
     callback=_share,
     help="Before learning, remove Gaussians until this share is left, such as 0.8: first those "
     "whose removal least changes what training views, and others beside them, show. auto keeps "
-    "what the photographs need. "
+    "what the photographs need; visible, what reaches a pixel of any view. "
     "--target-speedup counts from what is left.",
 )
 @click.option("--seed", type=int, default=0, show_default=True, help="Seed of the order of views.")
@@ -134,12 +135,6 @@ RULES = (
 )
 @shard_option
 @click.option("--no-truncation", is_flag=True, help="Ignore cutoffs stored with MODEL.")
-@click.option(
-    "--drop-invisible",
-    "drop",
-    is_flag=True,
-    help="Leave out Gaussians that reach no pixel of any training or held-out view.",
-)
 @click.option(
     "--again", is_flag=True, help="Begin anew, though OUT is finished or there is a checkpoint."
 )

@@ -24,12 +24,13 @@ from fragprune_plugins.workbench.figures.wording import (
 )
 from fragprune_plugins.workbench.finetune.result import FinetuneResult
 from fragprune_plugins.workbench.finetune.searching import Bounded
+from fragprune_plugins.workbench.finetune.trial import DROPOUT
 from fragprune_plugins.workbench.models import formats
-from fragprune_plugins.workbench.models.written import describe_dropped, describe_written
+from fragprune_plugins.workbench.models.written import describe_written
 from fragprune_plugins.workbench.scenes.dataset import Dataset
 
 LOST = 0.05
-"""A loss of PSNR against the model as it came, in dB, from which on own pictures are advised."""
+"""A loss of PSNR against the model as it came, in dB, from which on more is advised."""
 
 _OF_RECORDS = {"cameras", "curves", "photographs", "configuration", "text"}
 
@@ -43,9 +44,9 @@ class Finetuned:
         saved: the model in ``out``: of all processes, where they divided it.
         itself: the share of training views that are the model's own pictures; None for none.
         keep: the share of Gaussians to learn with, or how to choose it; None for all.
+        forgotten: dB that a trial made other photographs worse; None without a trial.
         removed: Gaussians that went before learning.
         found: what a search for the strongest truncation found; None without one.
-        dropped: counts of Gaussians that went at the end; None where that was not asked.
         truncated: the result has thresholds, here or in another process.
         shards: processes that hold a part of the Gaussians each; 1 where each holds them all.
     """
@@ -56,10 +57,10 @@ class Finetuned:
     result: FinetuneResult
     saved: Model
     itself: float | None
-    keep: float | Literal["auto"] | None
+    keep: float | Literal["auto", "visible"] | None
+    forgotten: float | None
     removed: int
     found: Bounded | None
-    dropped: dict[str, int] | None
     seed: int
     truncated: bool
     shards: int = 1
@@ -128,7 +129,7 @@ class Finetuned:
             "untruncated": without[0] if without else None,
             "self": self.itself,
             "keep": self.keep,
-            "dropped": self.dropped,
+            "forgotten": self.forgotten,
             "speedup": done.speedup,
             "faster": done.faster,
             "target_reached": done.target_reached,
@@ -160,7 +161,7 @@ class Finetuned:
             f"{result.engine} engine, {data['iterations']} iterations{pressure} in "
             f"{result.train_seconds:.0f} s.",
         ]
-        if (better := advise_own_pictures(data)) is not None:
+        if (better := advise(data)) is not None:
             lines.append(better)
         if self.shards > 1:
             lines.append(
@@ -177,14 +178,19 @@ class Finetuned:
                 f"{self.itself:.0%} of the training views were the model's own pictures, from "
                 "cameras beside those of the photographs."
             )
+        if self.forgotten is not None and settings.dropout:
+            lines.append(
+                f"A trial made other photographs {self.forgotten:.2f} dB worse, so MODEL knew its "
+                f"photographs by heart, and learned with --dropout {settings.dropout:g}."
+            )
         if self.keep is not None:
+            why = "whose removal changed the training views and those beside them least"
+            if self.keep == "visible":
+                why = f"which reached no pixel of the {views} views"
             lines.append(
                 f"Removed {self.removed:,} of {len(self.start.model):,} Gaussians before learning, "
-                "those whose removal changed the training views and those beside them least."
+                f"{why}."
             )
-        if self.dropped:
-            why = f"which reach no pixel of the {views} views"
-            lines.append(describe_dropped(self.dropped, why))
         plain = data["untruncated"]
         if plain is not None:
             lines.append(describe_untruncated(before, plain))
@@ -259,17 +265,17 @@ def _describe_bound(found: dict[str, Any], views: int) -> str:
     )
 
 
-def advise_own_pictures(data: dict[str, Any]) -> str | None:
-    """A line for a model that knew better as it came, and could have taught that; else None."""
+def advise(data: dict[str, Any]) -> str | None:
+    """A line for a model that lost what it knew as it came; None where nothing is left to try."""
     photographs = data["target"] != ITSELF and data["self"] is None and data["shards"] == 1
     learned = data["pressure"] is not None and data["settings"]["train"] == "all"
     if not (photographs and learned) or data["after"]["psnr"] > data["before"]["psnr"] - LOST:
         return None
-    fewer = " --keep 0.7" if data["keep"] is None else ""
-    return (
-        "MODEL as it came shows the held-out views better: if it was trained to its end, "
-        f"--self 0.5{fewer} may lose less."
-    )
+    more = [] if data["settings"]["dropout"] else [f"--dropout {DROPOUT:g}"]
+    more += ["--keep 0.6"] if data["keep"] is None else []
+    if not more:
+        return None
+    return f"MODEL as it came shows the held-out views better: {' '.join(more)} may lose less."
 
 
 def describe_untruncated(before: dict[str, Any], plain: dict[str, Any]) -> str:

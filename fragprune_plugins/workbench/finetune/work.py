@@ -32,9 +32,10 @@ from fragprune_plugins.workbench.finetune.finished import Finetuned
 from fragprune_plugins.workbench.finetune.result import FinetuneResult
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
 from fragprune_plugins.workbench.finetune.searching import Bounded, strongest
+from fragprune_plugins.workbench.finetune.trial import BY_HEART, DROPOUT, STEPS, forgotten
 from fragprune_plugins.workbench.goals import AtMost
 from fragprune_plugins.workbench.models import model as models
-from fragprune_plugins.workbench.models.written import dropping, require_place
+from fragprune_plugins.workbench.models.written import require_place
 from fragprune_plugins.workbench.pruning.scores import keep_best, keep_needed
 from fragprune_plugins.workbench.pruning.visibility import visible
 from fragprune_plugins.workbench.ranks import Ranks, joined, launched
@@ -53,11 +54,10 @@ class Asked:
     cameras: Path | None
     scene: SceneOptions
     settings: Settings
-    keep: float | Literal["auto"] | None
+    keep: float | Literal["auto", "visible"] | None
     seed: int
     shard: bool
     no_truncation: bool
-    drop: bool
     again: bool
     engine: EngineOptions
 
@@ -103,7 +103,8 @@ def finetune(**options: Any) -> Report | None:
             if ranks.gather(known is not None)[0]:
                 opened.checkpoints.clear()
                 return known
-            over, engine = _learned(opened, ranks)
+            opened, lost = _tried(opened)
+            over, engine = _learned(opened, ranks, lost)
             measured = None
             if asked.shard and not over.result.terminated:  # all draw, so all measure
                 measured = over.measured(opened.dataset, engine)
@@ -135,7 +136,7 @@ def _open(asked: Asked) -> _Opened:
             )
     checkpoints = Checkpoints(resuming.path_beside(asked.out), resuming.EVERY, tell=_say)
     configuration = resuming.configuration(whole, dataset, settings, engine.name)
-    configuration |= {"drop_invisible": asked.drop, "keep": asked.keep}
+    configuration |= {"keep": asked.keep}
     configuration |= {"sharded": True} if asked.shard else {}
     return _Opened(asked, whole, photographs, dataset, engine, device, checkpoints, configuration)
 
@@ -149,7 +150,29 @@ def _finished(opened: _Opened) -> Report | None:
     return finetuned.finished(asked.model, asked.out, opened.configuration)
 
 
-def _learned(opened: _Opened, ranks: Ranks) -> tuple[Finetuned, Engine]:
+def _tried(opened: _Opened) -> tuple[_Opened, float | None]:
+    """The same with the dropout that a trial chose, and what it found, if nobody chose one.
+
+    Own pictures hold a model's knowledge of photographs back as well, and in several processes a
+    trial would have to agree.
+    """
+    asked, settings = opened.asked, opened.asked.settings
+    chosen = settings.dropout is not None or asked.itself is not None
+    single = not isinstance(settings.goal, AtMost) and launched().size == 1
+    if chosen or not single or not settings.goal.learns or settings.train != "all":
+        return opened, None
+    dataset = opened.dataset.to(opened.device)
+    lost = forgotten(opened.whole, dataset, engine=opened.engine, seed=asked.seed)
+    if lost is None:
+        return opened, None
+    by_heart = lost >= BY_HEART
+    so = f"MODEL knows them by heart: --dropout {DROPOUT:g}" if by_heart else "no dropout"
+    _say(f"{STEPS} steps on half of the photographs change the others by {-lost:+.2f} dB: {so}")
+    settings = replace(settings, dropout=DROPOUT if by_heart else 0.0)
+    return replace(opened, asked=replace(asked, settings=settings)), lost
+
+
+def _learned(opened: _Opened, ranks: Ranks, lost: float | None) -> tuple[Finetuned, Engine]:
     """Learn with the other processes, save the result; also the engine that draws it."""
     asked, whole, engine = opened.asked, opened.whole, opened.engine
     count = len(whole)
@@ -173,9 +196,9 @@ def _learned(opened: _Opened, ranks: Ranks) -> tuple[Finetuned, Engine]:
         saved=saved.model,
         itself=asked.itself,
         keep=asked.keep,
+        forgotten=lost,
         removed=len(whole) - len(kept),
         found=found,
-        dropped=None,
         seed=asked.seed,
         truncated=ranks.gather(truncated)[0] if asked.shard else truncated,
         shards=ranks.size if asked.shard else 1,
@@ -184,12 +207,10 @@ def _learned(opened: _Opened, ranks: Ranks) -> tuple[Finetuned, Engine]:
 
 
 def _report(opened: _Opened, over: Finetuned, measured: list[dict[str, Any]] | None) -> Report:
-    """Say what came of it; before that, draw and drop what was asked for."""
+    """Say what came of it; before that, measure it."""
     asked, result = opened.asked, over.result
     if result.terminated:  # after SIGTERM there is no time for measurements
         return finetuned.terminated(asked.model, asked.out, result, over.found)
-    if asked.drop:
-        over = _drop_invisible(over, opened.dataset, opened.engine)
     figures = measured or over.measured(opened.dataset, opened.engine)
     pictures = asked.scene.as_record(asked.cameras) if asked.itself == 1 else None
     report = over.report(
@@ -205,9 +226,12 @@ def _say(text: str) -> None:
 
 
 def _keep(whole: Model, asked: Asked, dataset: Dataset, engine: Engine) -> Model:
-    """The Gaussians that --keep leaves, for what training views show and cameras beside them."""
+    """The Gaussians that --keep leaves, for what training views and cameras beside them show."""
     if asked.keep is None:
         return whole
+    if asked.keep == "visible":
+        views = [shot.view for shot in (*dataset.train, *dataset.test)]
+        return whole.keep(visible(whole, views, engine=engine))
     if asked.itself == 1:  # own pictures lie between all cameras already
         shots = dataset.train
         views = [shot.view for shot in shots]
@@ -229,13 +253,3 @@ def _learn(
         found = strongest(train, settings, dataset.test, engine=engine, say=_say)
         return found.result, found
     return train(settings, checkpoints=opened.checkpoints), None
-
-
-def _drop_invisible(over: Finetuned, dataset: Dataset, engine: Engine) -> Finetuned:
-    """Write the result again without Gaussians that no view shows."""
-    out, result = over.out, over.result
-    size, views = out.stat().st_size, [shot.view for shot in (*dataset.train, *dataset.test)]
-    left = replace(result, model=result.model.keep(visible(result.model, views, engine=engine)))
-    models.save(out, left)
-    dropped = dropping(out, size, len(result.model), len(left.model))
-    return replace(over, result=left, saved=left.model, dropped=dropped)

@@ -1,0 +1,117 @@
+"""A model that knows its photographs by heart, and what it then learns with."""
+
+from dataclasses import dataclass
+
+import pytest
+import torch
+from cli.commands import run_json
+from finetune import tiny
+
+from fragprune_plugins.engines import create_engine
+from fragprune_plugins.plugins.hookspecs import hookimpl
+from fragprune_plugins.plugins.loading import installed
+from fragprune_plugins.workbench.finetune import work
+from fragprune_plugins.workbench.finetune.trial import BY_HEART, DROPOUT, forgotten
+from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
+
+
+@dataclass(frozen=True, eq=False)
+class Inverted(Shot):
+    """A photograph in colours that no other one shows."""
+
+    true: torch.Tensor
+
+    @property
+    def image(self):
+        return 1 - self.true
+
+
+@pytest.fixture(scope="module")
+def engine():
+    return create_engine("cpu")
+
+
+@pytest.fixture(scope="module")
+def photographs(dataset):
+    return Dataset([*dataset.train, *dataset.test], [])
+
+
+def test_what_holds_for_all_photographs_is_not_forgotten(model, photographs, engine):
+    assert forgotten(model, photographs, engine=engine) < 0
+
+
+def test_what_holds_for_some_photographs_alone_is_forgotten(truth, photographs, engine):
+    shots = [
+        shot if number % 2 else Inverted(shot.name, shot.view, shot.image)
+        for number, shot in enumerate(photographs.train)
+    ]
+    assert forgotten(truth, Dataset(shots, []), engine=engine) > 10 * BY_HEART
+
+
+def test_few_photographs_tell_nothing(model, dataset, engine):
+    assert len(dataset.train) == 7
+    assert forgotten(model, dataset, engine=engine) is None
+
+
+def test_a_trial_leaves_no_trace(model, photographs, engine, request):
+    heard = []
+
+    class Observer:
+        @hookimpl
+        def fragprune_step(self, stats):
+            heard.append(stats)
+
+    request.addfinalizer(lambda: installed().remove("observer"))
+    installed().register(Observer(), "observer")
+    before, state = model.xyz.clone(), torch.random.get_rng_state()
+    first = forgotten(model, photographs, engine=engine)
+    assert first == forgotten(model, photographs, engine=engine)
+    assert heard == []
+    assert torch.equal(model.xyz, before)
+    assert torch.equal(torch.random.get_rng_state(), state)
+
+
+@pytest.fixture
+def command(tmp_path, monkeypatch):
+    """Runs ``finetune`` with what a trial is to find; it fails if None and a trial is made."""
+    data, path, _ = tiny.scene(tmp_path)
+
+    def tuned(found, *options):
+        def trial(*_, **__):
+            assert found is not None, "nothing was to be tried"
+            return found
+
+        monkeypatch.setattr(work, "forgotten", trial)
+        out = tmp_path / "out.ply"
+        return run_json(
+            "finetune", path, "--data", data, "--out", out, "--iters", 4, "--again", *options
+        )
+
+    return tuned
+
+
+@pytest.mark.parametrize(("found", "dropout"), [(BY_HEART, DROPOUT), (BY_HEART - 0.01, 0.0)])
+def test_the_trial_chooses_the_dropout(command, found, dropout):
+    report = command(found)
+    assert report["settings"]["dropout"] == dropout
+    assert report["forgotten"] == found
+
+
+@pytest.mark.parametrize(
+    ("options", "dropout"),
+    [
+        (("--dropout", 0.3), 0.3),
+        (("--dropout", 0), 0.0),
+        (("--control",), None),
+        (("--portable",), None),
+        (("--self", 0.5), None),
+        (("--train", "opacity"), None),
+        (("--max-drop", 5), None),
+    ],
+)
+def test_nothing_is_tried_where_somebody_chose_or_nothing_is_to_be_chosen(
+    command, options, dropout
+):
+    report = command(None, *options)
+    assert report["settings"]["dropout"] == dropout
+    assert report["forgotten"] is None
