@@ -35,7 +35,7 @@ def test_drops_what_no_view_can_draw(tmp_path):
     write_ply(path, tiny.cut(replace(model, opacity=opacity), thresholds))
     out = tmp_path / "out.ply"
     assert run_json("export", path, "--out", out)["dropped"] is None
-    report = run_json("export", path, "--out", out, "--drop-invisible")
+    report = run_json("export", path, "--out", out, "--keep", "visible")
     assert report["gaussians"] == len(model) - 4
     assert report["dropped"]["gaussians"] == 4
     assert report["dropped"]["bytes_before"] == path.stat().st_size
@@ -45,7 +45,7 @@ def test_drops_what_no_view_can_draw(tmp_path):
     exported = read_ply(out)
     assert torch.equal(exported.falloff, thresholds[kept])
     assert torch.equal(exported.xyz, model.xyz[kept])
-    text = run("export", path, "--out", out, "--drop-invisible").stdout
+    text = run("export", path, "--out", out, "--keep", "visible").stdout
     assert "Dropped 4 of 60 Gaussians, too faint for any view: " in text
 
 

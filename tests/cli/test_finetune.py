@@ -15,7 +15,7 @@ from fragprune_plugins.files import records, sidecar
 from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.learning.pressure import LEAST_PRESSURE
 from fragprune_plugins.workbench.finetune import loop
-from fragprune_plugins.workbench.finetune.finished import advise_own_pictures, describe_untruncated
+from fragprune_plugins.workbench.finetune.finished import advise, describe_untruncated
 from fragprune_plugins.workbench.goals import parse_goal
 from fragprune_plugins.workbench.models.formats.ply import write_ply
 
@@ -110,44 +110,44 @@ def test_a_model_that_other_viewers_draw_badly_says_what_to_do(drop, advised):
     ("drop", "more", "advised"),
     [
         (0.04, {}, False),
-        (0.06, {}, "--self 0.5 --keep 0.7 may"),
-        (0.06, {"keep": 0.6}, "--self 0.5 may"),
+        (0.06, {}, "--dropout 0.2 --keep 0.6 may"),
+        (0.06, {"keep": 0.6}, "--dropout 0.2 may"),
+        (0.06, {"settings": {"train": "all", "dropout": 0.2}}, "better: --keep 0.6 may"),
+        (0.06, {"settings": {"train": "all", "dropout": 0.2}, "keep": 0.6}, False),
         (0.06, {"self": 0.5}, False),
         (0.06, {"target": "itself"}, False),
         (0.06, {"pressure": None}, False),
         (0.06, {"settings": {"train": "opacity"}}, False),
     ],
 )
-def test_a_model_that_was_better_as_it_came_can_teach_that(drop, more, advised):
+def test_a_model_that_was_better_as_it_came_is_told_what_may_help(drop, more, advised):
     data = {"target": "photographs", "self": None, "keep": None, "shards": 1, "pressure": 1e-4}
     data |= {"before": {"psnr": 30.0}, "after": {"psnr": 30.0 - drop}}
-    line = advise_own_pictures(data | {"settings": {"train": "all"}} | more)
+    line = advise(data | {"settings": {"train": "all", "dropout": 0.0}} | more)
     assert (advised in line) if advised else line is None
 
 
-def test_drops_what_reaches_no_pixel_and_changes_no_picture(scene, tmp_path):
+def test_removes_what_reaches_no_pixel_and_changes_no_picture(scene, tmp_path):
     data, path, model = scene
     xyz = model.xyz.clone()
     xyz[:7, 1] += 50  # out of every picture
     write_ply(path, replace(model, xyz=xyz))
     whole, less = tmp_path / "whole.ply", tmp_path / "less.ply"
     arguments = ("finetune", path, "--data", data, "--iters", 10)
-    first = run_json(*arguments, "--out", whole)
-    report = run_json(*arguments, "--out", less, "--drop-invisible")
-    assert first["dropped"] is None
-    count = report["dropped"]["gaussians"]
+    run_json(*arguments, "--out", whole)
+    report = run_json(*arguments, "--out", less, "--keep", "visible")
+    count = len(model) - len(read_ply(less))
     assert count >= 7
-    assert report["after"]["gaussians"] == len(model) - count == len(read_ply(less))
+    assert report["after"]["gaussians"] == len(model) - count
     assert report["before"]["gaussians"] == len(model)
-    assert report["dropped"]["bytes_before"] == whole.stat().st_size
-    assert report["dropped"]["bytes_after"] == less.stat().st_size
     both = run_json("compare", whole, less, "--data", data, "--views", "all")
     assert both["a"]["fragments_per_pixel"] == both["b"]["fragments_per_pixel"]
     assert both["psnr_change"] == pytest.approx(0, abs=1e-4)
     store, old = read_ply(less).falloff, read_ply(whole).falloff
     assert torch.equal(store, old[torch.isin(old, store)])
-    text = run(*arguments, "--out", less, "--drop-invisible").stdout
-    assert f"Dropped {count} of 60 Gaussians, which reach no pixel of the 9 views: " in text
+    text = run(*arguments, "--out", less, "--keep", "visible", "--again").stdout
+    why = "which reached no pixel of the 9 views"
+    assert f"Removed {count} of 60 Gaussians before learning, {why}." in text
 
 
 def test_removes_gaussians_before_learning(scene, words, out):

@@ -78,7 +78,7 @@ def test_the_file_has_no_thresholds_and_takes_the_sidecar_of_an_earlier_one_away
     assert set(profile["columns"]) == {"untruncated"}
 
 
-@pytest.mark.parametrize("more", [(), ("--drop-invisible",)])
+@pytest.mark.parametrize("more", [(), ("--keep", "visible")])
 def test_the_record_has_the_area_of_both(scene, tmp_path, more):
     data, path, model = scene
     out = tmp_path / "out.ply"
