@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from fragprune_plugins.workbench.scenes.cameras import load_cameras
     from fragprune_plugins.workbench.scenes.dataset import load_dataset
     from fragprune_plugins.workbench.scenes.generated import views_near
-    from fragprune_plugins.workbench.scenes.itself import own_pictures, with_own_pictures
+    from fragprune_plugins.workbench.scenes.itself import own_pictures
     from fragprune_plugins.workbench.scenes.pinhole import look_at
 
 __version__ = VERSION
@@ -65,7 +65,7 @@ _NAMES = {
     "workbench.scenes.cameras": "load_cameras",
     "workbench.scenes.dataset": "load_dataset",
     "workbench.scenes.generated": "views_near",
-    "workbench.scenes.itself": "own_pictures with_own_pictures",
+    "workbench.scenes.itself": "own_pictures",
     "workbench.scenes.pinhole": "look_at",
 }
 """By module, the names that it gives this package."""
@@ -113,7 +113,6 @@ __all__ = [
     "save",
     "views_near",
     "whole_of",
-    "with_own_pictures",
 ]
 
 

@@ -120,10 +120,7 @@ def test_the_model_itself_is_no_output(scene, command):
         ("report d --out page.pdf", "'page.pdf' does not end with .html"),
         ("view FILE --data x --cameras y", "--cameras"),
         ("view FILE --port 70000", "--port"),
-        *(
-            (f"finetune FILE --out out.ply --self {share}", "is no share of the views")
-            for share in ("model.ply", "1.5", "0.95", "0")
-        ),
+        ("finetune FILE --out out.ply --dropout 0.95", "--dropout"),
         *(
             (f"finetune FILE --out out.ply --log {log}", "--log")
             for log in ("csv", "csv:", "paper:x", ":x", "bar:3")

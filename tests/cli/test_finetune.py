@@ -114,7 +114,6 @@ def test_a_model_that_other_viewers_draw_badly_says_what_to_do(drop, advised):
         (0.06, {"keep": 0.6}, "--dropout 0.2 may"),
         (0.06, {"settings": {"train": "all", "dropout": 0.2}}, "better: --keep 0.6 may"),
         (0.06, {"settings": {"train": "all", "dropout": 0.2}, "keep": 0.6}, False),
-        (0.06, {"self": 0.5}, False),
         (0.06, {"target": "itself"}, False),
         (0.06, {"pressure": None}, False),
         (0.06, {"settings": {"train": "opacity"}}, False),
@@ -166,8 +165,7 @@ def test_removes_gaussians_before_learning(scene, words, out):
     assert "Removed 24 of 60 Gaussians before learning" in result.stdout
 
 
-@pytest.mark.parametrize("more", [(), ("--self", 0.5)])
-def test_what_shows_beside_the_photographs_stays(scene, words, out, more):
+def test_what_shows_beside_the_photographs_stays(scene, words, out):
     data, _, model = scene
     shots = fp.load_dataset(data).train
     views = fp.views_near(shots)
@@ -175,7 +173,7 @@ def test_what_shows_beside_the_photographs_stays(scene, words, out, more):
         (0.7, fp.keep_best(model, 0.7, views)),
         ("auto", fp.keep_needed(model, shots, views)),
     ):
-        report = run_json(*words, 3, *more, "--keep", keep, "--train", "opacity")
+        report = run_json(*words, 3, "--keep", keep, "--train", "opacity")
         assert report["keep"] == keep
         assert torch.equal(read_ply(out).xyz, expected.xyz)
     alone = fp.keep_best(model, 0.7, [shot.view for shot in shots])

@@ -9,8 +9,6 @@ from cli.commands import fails, run, run_json
 from finetune import tiny
 
 import fragprune_plugins as fp
-from fragprune_plugins.errors import DatasetError
-from fragprune_plugins.files import records
 from fragprune_plugins.learning.pressure import OWN_PRESSURE
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.types import RasterInputs
@@ -177,53 +175,9 @@ def test_in_python_needs_no_cameras(scene):
     assert float(image.max()) > 0.1
 
 
-def test_a_share_of_own_pictures_stands_beside_the_photographs(scene, tmp_path):
-    data, path, model = scene
-    photographs = fp.load_dataset(data)
-    mixed = fp.with_own_pictures(photographs, path, 0.5)
-    count = len(photographs.train)
-    assert [shot.target for shot in mixed.train] == ["photographs"] * count + ["itself"] * count
-    assert [shot.name for shot in mixed.test] == [shot.name for shot in photographs.test]
-    own = mixed.train[-1]
-    with torch.no_grad():
-        shown = fp.rasterize(RasterInputs(own.view, model.splats())).image
-    assert torch.equal(own.image, shown)
-
-
-def test_photographs_that_look_apart_have_nothing_beside_them(scene):
-    data, path, _ = scene
-    photographs = fp.load_dataset(data)
-    with pytest.raises(DatasetError, match="no two of which"):
-        fp.with_own_pictures(replace(photographs, train=photographs.train[:1]), path, 0.5)
-
-
-def test_the_command_learns_from_both(scene, tmp_path):
-    data, path, _ = scene
-    out, plain = tmp_path / "out.ply", tmp_path / "plain.ply"
-    arguments = ("finetune", path, "--data", data, "--iters", 20, "--threads", 1)
-    text = run(*arguments, "--out", out, "--self", 0.5, "--keep", "auto").stdout
-    assert "50% of the training views were the model's own pictures" in text
-    run(*arguments, "--out", plain, "--keep", "auto")
-    assert not torch.equal(fp.load(out).xyz, fp.load(plain).xyz)
-    record = records.beside(out).data
-    assert record["target"] == "photographs"
-    assert record["self"] == 0.5
-    assert record["settings"]["itself"] is False
-
-
-@pytest.mark.parametrize(("line", "target"), [("true", "itself"), ("0.5", "photographs")])
-def test_a_file_of_options_says_it_with_or_without_a_share(scene, line, target, tmp_path):
+def test_a_file_of_options_says_it(scene, tmp_path):
     data, path, _ = scene
     config = tmp_path / "options.toml"
-    config.write_text(f"self = {line}\niters = 2\n")
+    config.write_text("self = true\niters = 2\n")
     arguments = ("finetune", path, "--data", data, "--out", tmp_path / "out.ply")
-    assert run_json(*arguments, "--config", config)["target"] == target
-
-
-@pytest.mark.parametrize("share", [("--self",), ("--self", 0.5)])
-def test_cameras_of_ones_own_are_for_own_pictures_alone(scene, cameras, share, tmp_path):
-    _, path, _ = scene
-    words = ("finetune", path, *share, "--cameras", cameras, "--iters", 1)
-    result = run(*words, "--out", tmp_path / "out.ply")
-    assert result.exit_code == (2 if len(share) > 1 else 0)
-    assert ("cameras beside those of --data" in result.stderr) == (len(share) > 1)
+    assert run_json(*arguments, "--config", config)["target"] == "itself"

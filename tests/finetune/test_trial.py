@@ -104,7 +104,7 @@ def test_the_trial_chooses_the_dropout(command, found, dropout):
         (("--dropout", 0), 0.0),
         (("--control",), None),
         (("--portable",), None),
-        (("--self", 0.5), None),
+        (("--self",), None),
         (("--train", "opacity"), None),
         (("--max-drop", 5), None),
     ],

@@ -178,7 +178,7 @@ def learning_options(*, every_goal: bool) -> Callable[[Callable[..., Any]], Call
             max_drop: float | None = None,
             **kwargs: Any,
         ) -> Any:
-            itself = kwargs.get("itself") == 1  # True, or the share of own pictures
+            itself = kwargs.get("itself", False)
             default = QUICK_ITERATIONS if quick or itself else FINETUNE_ITERATIONS
             views = kwargs.pop("views_per_step", 1)
             with _spelled():

@@ -42,7 +42,7 @@ class Finetuned:
     Attributes:
         start: the model as it came in.
         saved: the model in ``out``: of all processes, where they divided it.
-        itself: the share of training views that are the model's own pictures; None for none.
+        itself: the model's own pictures were the training views.
         keep: the share of Gaussians to learn with, or how to choose it; None for all.
         forgotten: dB that a trial made other photographs worse; None without a trial.
         removed: Gaussians that went before learning.
@@ -56,7 +56,7 @@ class Finetuned:
     start: Candidate
     result: FinetuneResult
     saved: Model
-    itself: float | None
+    itself: bool
     keep: float | Literal["auto", "visible"] | None
     forgotten: float | None
     removed: int
@@ -173,11 +173,6 @@ class Finetuned:
         if result.interrupted:
             of = f"{data['iterations']} of {settings.iterations}"
             lines.append(f"Interrupted at {of} iterations. {_goes_on(self.found)}")
-        if self.itself is not None and self.itself < 1:
-            lines.append(
-                f"{self.itself:.0%} of the training views were the model's own pictures, from "
-                "cameras beside those of the photographs."
-            )
         if self.forgotten is not None and settings.dropout:
             lines.append(
                 f"A trial made other photographs {self.forgotten:.2f} dB worse, so MODEL knew its "
@@ -267,7 +262,7 @@ def _describe_bound(found: dict[str, Any], views: int) -> str:
 
 def advise(data: dict[str, Any]) -> str | None:
     """A line for a model that lost what it knew as it came; None where nothing is left to try."""
-    photographs = data["target"] != ITSELF and data["self"] is None and data["shards"] == 1
+    photographs = data["target"] != ITSELF and data["shards"] == 1
     learned = data["pressure"] is not None and data["settings"]["train"] == "all"
     if not (photographs and learned) or data["after"]["psnr"] > data["before"]["psnr"] - LOST:
         return None

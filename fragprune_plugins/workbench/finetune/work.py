@@ -41,7 +41,6 @@ from fragprune_plugins.workbench.pruning.visibility import visible
 from fragprune_plugins.workbench.ranks import Ranks, joined, launched
 from fragprune_plugins.workbench.scenes.dataset import Dataset, load_photographs
 from fragprune_plugins.workbench.scenes.generated import views_near
-from fragprune_plugins.workbench.scenes.itself import with_own_pictures
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,7 @@ class Asked:
 
     model: Path
     out: Path
-    itself: float | None
+    itself: bool
     cameras: Path | None
     scene: SceneOptions
     settings: Settings
@@ -116,7 +115,7 @@ def finetune(**options: Any) -> Report | None:
 def _open(asked: Asked) -> _Opened:
     """Read the model and its photographs, or draw its pictures."""
     scene, settings, photographs = asked.scene, asked.settings, None
-    if scene.data is not None or asked.itself != 1:
+    if scene.data is not None or not asked.itself:
         remedy = "Pass --data FOLDER with photographs; without any, --self."
         photographs = photographs_for(asked.model, scene, remedy=remedy)
     engine, device = open_engine(asked.engine)
@@ -124,16 +123,11 @@ def _open(asked: Asked) -> _Opened:
     truncation = settings.goal.presses and not asked.no_truncation
     where = "cpu" if asked.shard else device
     whole = models.load(asked.model, truncation=truncation, device=where)
-    if asked.itself == 1:
+    if asked.itself:
         dataset = pictures_of(whole, scene, asked.cameras, engine, seed=asked.seed)
     else:
         assert photographs is not None
         dataset = load_photographs(photographs)
-        if asked.itself:
-            dataset = dataset.to(whole.device)
-            dataset = with_own_pictures(
-                dataset, whole, asked.itself, engine=engine, seed=asked.seed
-            )
     checkpoints = Checkpoints(resuming.path_beside(asked.out), resuming.EVERY, tell=_say)
     configuration = resuming.configuration(whole, dataset, settings, engine.name)
     configuration |= {"keep": asked.keep}
@@ -153,11 +147,10 @@ def _finished(opened: _Opened) -> Report | None:
 def _tried(opened: _Opened) -> tuple[_Opened, float | None]:
     """The same with the dropout that a trial chose, and what it found, if nobody chose one.
 
-    Own pictures hold a model's knowledge of photographs back as well, and in several processes a
-    trial would have to agree.
+    In several processes the trials would have to agree.
     """
     asked, settings = opened.asked, opened.asked.settings
-    chosen = settings.dropout is not None or asked.itself is not None
+    chosen = settings.dropout is not None or asked.itself
     single = not isinstance(settings.goal, AtMost) and launched().size == 1
     if chosen or not single or not settings.goal.learns or settings.train != "all":
         return opened, None
@@ -212,7 +205,7 @@ def _report(opened: _Opened, over: Finetuned, measured: list[dict[str, Any]] | N
     if result.terminated:  # after SIGTERM there is no time for measurements
         return finetuned.terminated(asked.model, asked.out, result, over.found)
     figures = measured or over.measured(opened.dataset, opened.engine)
-    pictures = asked.scene.as_record(asked.cameras) if asked.itself == 1 else None
+    pictures = asked.scene.as_record(asked.cameras) if asked.itself else None
     report = over.report(
         figures, opened.dataset, opened.photographs, opened.configuration, pictures
     )
@@ -232,12 +225,9 @@ def _keep(whole: Model, asked: Asked, dataset: Dataset, engine: Engine) -> Model
     if asked.keep == "visible":
         views = [shot.view for shot in (*dataset.train, *dataset.test)]
         return whole.keep(visible(whole, views, engine=engine))
-    if asked.itself == 1:  # own pictures lie between all cameras already
-        shots = dataset.train
-        views = [shot.view for shot in shots]
-    else:
-        shots = [shot for shot in dataset.train if shot.target == "photographs"]
-        views = views_near(shots, seed=asked.seed)
+    shots = dataset.train
+    between = asked.itself  # own pictures lie between all cameras already
+    views = [shot.view for shot in shots] if between else views_near(shots, seed=asked.seed)
     if asked.keep == "auto":
         return keep_needed(whole, shots, views, engine=engine, progress=True)
     return keep_best(whole, asked.keep, views, engine=engine, progress=True)

@@ -1,4 +1,4 @@
-"""A model's own pictures, instead of photographs or beside them: what it showed as it came in."""
+"""A model's own pictures instead of photographs: what it showed as it came in."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.errors import DatasetError, InputError
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.plugins.hooks import engine_for
 from fragprune_plugins.types import RasterInputs, View, one_line
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
-from fragprune_plugins.workbench.scenes.generated import Named, around, beside, between, hold_out
+from fragprune_plugins.workbench.scenes.generated import Named, around, between, hold_out
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,48 +74,6 @@ def own_pictures(
         for part in ([*views, *between(views, seed=seed)], held_out)
     )
     return Dataset(train, test).to(model.device)
-
-
-def with_own_pictures(
-    dataset: Dataset,
-    model: Model | models.Trained | str | Path,
-    share: float,
-    *,
-    engine: str | Engine = "auto",
-    seed: int = 0,
-) -> Dataset:
-    """Photographs, and a model's own pictures from cameras beside theirs.
-
-    Truncation that suits the photographs' cameras alone shows elsewhere. A model that was trained
-    to its end can teach what to see there; one that is still learning is held back by it.
-
-    Args:
-        dataset: the photographs; those that are held out stay as they are.
-        model: what ``load`` gave, the result of a training, or a file. It is kept.
-        share: of the training views that are own pictures, 0 to below 1.
-        engine: a name or an engine.
-        seed: of the cameras.
-
-    Raises:
-        EngineError: no such engine here.
-        DatasetError: no two photographs look the same way.
-        InputError: the share is out of range.
-    """
-    if not 0 <= share < 1:
-        raise InputError("share", f"{share:g}", "0 <= X < 1", "Choose one, such as 0.5.")
-    model = models.of(model)
-    draw = _drawing(model, engine)
-    views = [(shot.name, shot.view) for shot in dataset.train]
-    count = round(len(views) * share / (1 - share))
-    own = [OwnPicture(name, view, draw) for name, view in beside(views, count, seed=seed)]
-    if len(own) < count:
-        raise DatasetError(
-            "cameras",
-            f"{len(views)} training views, no two of which look the same way",
-            "two or more that do: own pictures lie beside them",
-            "Train without own pictures.",
-        )
-    return Dataset([*dataset.train, *own], dataset.test).to(model.device)
 
 
 def _drawing(model: Model, engine: str | Engine) -> Callable[[View], Tensor]:
