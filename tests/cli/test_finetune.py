@@ -201,7 +201,8 @@ def measured(goal, psnr=30.0, iterations=3, keep=None, **settings):
     [
         ({}, {}, True),
         ({"keep": 0.5}, {"keep": 0.5}, True),
-        ({}, {"keep": 0.5}, False),
+        ({}, {"keep": 0.5}, True),
+        ({"keep": 0.5}, {}, False),
         ({}, {"views_per_step": 2}, False),
         ({}, {"seed": 1}, False),
         ({}, {"iterations": 4}, False),

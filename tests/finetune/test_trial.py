@@ -11,7 +11,7 @@ from fragprune_plugins.engines import create_engine
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import installed
 from fragprune_plugins.workbench.finetune import work
-from fragprune_plugins.workbench.finetune.trial import BY_HEART, DROPOUT, forgotten
+from fragprune_plugins.workbench.finetune.trial import BY_HEART, DROPOUT, KEEP, forgotten
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 
 
@@ -90,11 +90,20 @@ def command(tmp_path, monkeypatch):
     return tuned
 
 
-@pytest.mark.parametrize(("found", "dropout"), [(BY_HEART, DROPOUT), (BY_HEART - 0.01, 0.0)])
-def test_the_trial_chooses_the_dropout(command, found, dropout):
-    report = command(found)
-    assert report["settings"]["dropout"] == dropout
+@pytest.mark.parametrize(
+    ("found", "options", "dropout", "keep"),
+    [
+        (BY_HEART, (), DROPOUT, KEEP),
+        (BY_HEART, ("--keep", 1), DROPOUT, 1),
+        (BY_HEART, ("--target-speedup", 1.2), DROPOUT, None),
+        (BY_HEART - 0.01, (), None, None),
+    ],
+)
+def test_the_trial_chooses_what_nobody_chose(command, found, options, dropout, keep):
+    report = command(found, *options)
+    assert (report["settings"]["dropout"], report["keep"]) == (dropout, keep)
     assert report["forgotten"] == found
+    assert report["after"]["gaussians"] == (keep or 1) * 60
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from fragprune_plugins.engines.cpu.memory import keep_freed_memory
 from fragprune_plugins.files.atomic import locked
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs
+from fragprune_plugins.learning.goals import Fewer
 from fragprune_plugins.learning.interruption import sigterm_interrupts
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.workbench.commands.command import Report
@@ -32,8 +33,8 @@ from fragprune_plugins.workbench.finetune.finished import Finetuned
 from fragprune_plugins.workbench.finetune.result import FinetuneResult
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
 from fragprune_plugins.workbench.finetune.searching import Bounded, strongest
-from fragprune_plugins.workbench.finetune.trial import BY_HEART, DROPOUT, STEPS, forgotten
-from fragprune_plugins.workbench.goals import AtMost
+from fragprune_plugins.workbench.finetune.trial import BY_HEART, DROPOUT, KEEP, STEPS, forgotten
+from fragprune_plugins.workbench.goals import AtMost, Faster
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.models.written import require_place
 from fragprune_plugins.workbench.pruning.scores import keep_best, keep_needed
@@ -102,8 +103,8 @@ def finetune(**options: Any) -> Report | None:
             if ranks.gather(known is not None)[0]:
                 opened.checkpoints.clear()
                 return known
-            opened, lost = _tried(opened)
-            over, engine = _learned(opened, ranks, lost)
+            chosen, lost = _tried(opened)
+            over, engine = _learned(chosen, ranks, lost)
             measured = None
             if asked.shard and not over.result.terminated:  # all draw, so all measure
                 measured = over.measured(opened.dataset, engine)
@@ -145,9 +146,9 @@ def _finished(opened: _Opened) -> Report | None:
 
 
 def _tried(opened: _Opened) -> tuple[_Opened, float | None]:
-    """The same with the dropout that a trial chose, and what it found, if nobody chose one.
+    """What a trial found, and the same with what it chose: dropout, and a share to keep.
 
-    In several processes the trials would have to agree.
+    It is made where nobody chose a dropout. In several processes the trials would have to agree.
     """
     asked, settings = opened.asked, opened.asked.settings
     chosen = settings.dropout is not None or asked.itself
@@ -158,11 +159,16 @@ def _tried(opened: _Opened) -> tuple[_Opened, float | None]:
     lost = forgotten(opened.whole, dataset, engine=opened.engine, seed=asked.seed)
     if lost is None:
         return opened, None
-    by_heart = lost >= BY_HEART
-    so = f"MODEL knows them by heart: --dropout {DROPOUT:g}" if by_heart else "no dropout"
-    _say(f"{STEPS} steps on half of the photographs change the others by {-lost:+.2f} dB: {so}")
-    settings = replace(settings, dropout=DROPOUT if by_heart else 0.0)
-    return replace(opened, asked=replace(asked, settings=settings)), lost
+    told = f"{STEPS} steps on half of the photographs change the others by {-lost:+.2f} dB"
+    if lost < BY_HEART:
+        _say(f"{told}: no dropout")
+        return opened, lost
+    ratio = isinstance(settings.goal, Fewer | Faster)  # to the fragments or frames of what is left
+    keep = KEEP if asked.keep is None and not ratio else asked.keep
+    options = f"--dropout {DROPOUT:g}" + (f" --keep {keep}" if keep else "")
+    _say(f"{told}: MODEL knows them by heart, so {options}")
+    asked = replace(asked, keep=keep, settings=replace(settings, dropout=DROPOUT))
+    return replace(opened, asked=asked), lost
 
 
 def _learned(opened: _Opened, ranks: Ranks, lost: float | None) -> tuple[Finetuned, Engine]:
