@@ -162,33 +162,6 @@ def one_splat(
     return cast(RasterInputs(view=view, splats=splats), dtype)
 
 
-def two_overlapping(
-    *, opacities: tuple[float, float] = (0.6, 0.7), dtype: torch.dtype = torch.float32
-) -> RasterInputs:
-    """A red splat before a green one, stored back first, over a blue background; 24x20 pixels."""
-    back = one_splat(
-        (13.0, 10.0),
-        depth=3.0,
-        opacity=opacities[1],
-        color=(0.0, 1.0, 0.0),
-        background=(0.0, 0.0, 1.0),
-        dtype=dtype,
-        width=24,
-        height=20,
-    )
-    front = one_splat(
-        (10.0, 9.0),
-        sigma=(3.0, 1.5),
-        angle=0.5,
-        opacity=opacities[0],
-        color=(1.0, 0.0, 0.0),
-        dtype=dtype,
-        width=24,
-        height=20,
-    )
-    return replace(back, splats=concatenate(back.splats, front.splats))
-
-
 def stack(
     opacities: list[float], *, dtype: torch.dtype = torch.float32, width: int = 17, height: int = 17
 ) -> RasterInputs:

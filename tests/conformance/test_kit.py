@@ -141,7 +141,7 @@ def test_pytest_does_not_load_the_kits_plugin_by_itself():
 
 def test_every_adapter_is_driven():
     tested = Path(__file__).parent.glob("test_*.py")
-    driven = re.compile(r'^    adapter = "(.+)"$', re.MULTILINE)
+    driven = re.compile(r'^(?:    adapter = |\w+ = relative\()"(.+?)"', re.MULTILINE)
     said = {name for file in tested for name in driven.findall(file.read_text())}
     adapters = load_plugins().adapters
     # A method has its host's whole package under it, whose own tests are in tests/studio.

@@ -149,9 +149,9 @@ def test_memory_that_frames_leave_behind_is_found(device: EmulatedDevice, monkey
     left = []
 
     class Leaking(frame.Drawing):
-        def draw(self, *given, **how) -> frame.Drawn:
+        def draw(self, *given, **how) -> dict[str, torch.Tensor | None]:
             drawn = super().draw(*given, **how)
-            left.append(drawn.alpha)
+            left.append(drawn["alpha"])
             return drawn
 
     monkeypatch.setattr(cuda, "Drawing", Leaking)
