@@ -24,7 +24,7 @@ from fragprune_plugins.workbench.figures.wording import (
 )
 from fragprune_plugins.workbench.finetune.result import FinetuneResult
 from fragprune_plugins.workbench.finetune.searching import Bounded
-from fragprune_plugins.workbench.finetune.trial import DROPOUT
+from fragprune_plugins.workbench.finetune.trial import DROPOUT, KEEP
 from fragprune_plugins.workbench.models import formats
 from fragprune_plugins.workbench.models.written import describe_written
 from fragprune_plugins.workbench.scenes.dataset import Dataset
@@ -267,7 +267,7 @@ def advise(data: dict[str, Any]) -> str | None:
     if not (photographs and learned) or data["after"]["psnr"] > data["before"]["psnr"] - LOST:
         return None
     more = [] if data["settings"]["dropout"] else [f"--dropout {DROPOUT:g}"]
-    more += ["--keep 0.6"] if data["keep"] is None else []
+    more += [f"--keep {KEEP:g}"] if data["keep"] is None else []
     if not more:
         return None
     return f"MODEL as it came shows the held-out views better: {' '.join(more)} may lose less."

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
@@ -30,7 +30,14 @@ _VIEWS = 24  # to measure on
 _FEWEST = 8  # photographs, to tell anything
 
 
-def forgotten(model: Model, dataset: Dataset, *, engine: Engine, seed: int = 0) -> float | None:
+def forgotten(
+    model: Model,
+    dataset: Dataset,
+    *,
+    engine: Engine,
+    seed: int = 0,
+    say: Callable[[str], None] = lambda _: None,
+) -> float | None:
     """How much worse a model shows photographs after some steps on the others, in dB.
 
     What a model has learned of the scene, steps on every second photograph improve or leave as it
@@ -41,6 +48,7 @@ def forgotten(model: Model, dataset: Dataset, *, engine: Engine, seed: int = 0) 
         dataset: its photographs, on the model's device.
         engine: draws.
         seed: of the order of views.
+        say: is told in a sentence what is tried, before.
 
     Returns:
         PSNR before minus PSNR after, the mean over at most 24 views; None for fewer than eight
@@ -48,6 +56,7 @@ def forgotten(model: Model, dataset: Dataset, *, engine: Engine, seed: int = 0) 
     """
     if len(dataset.train) < _FEWEST:
         return None
+    say(f"trying whether MODEL knows its photographs by heart: {STEPS} steps on half of them")
     learned, others = dataset.train[::2], evenly(dataset.train[1::2], _VIEWS)
     whole = model.untruncated()
     settings = Settings(iterations=STEPS, goal=Control(), seed=seed)

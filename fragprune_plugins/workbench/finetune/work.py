@@ -33,7 +33,7 @@ from fragprune_plugins.workbench.finetune.finished import Finetuned
 from fragprune_plugins.workbench.finetune.result import FinetuneResult
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
 from fragprune_plugins.workbench.finetune.searching import Bounded, strongest
-from fragprune_plugins.workbench.finetune.trial import BY_HEART, DROPOUT, KEEP, STEPS, forgotten
+from fragprune_plugins.workbench.finetune.trial import BY_HEART, DROPOUT, KEEP, forgotten
 from fragprune_plugins.workbench.goals import AtMost, Faster
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.models.written import require_place
@@ -156,17 +156,17 @@ def _tried(opened: _Opened) -> tuple[_Opened, float | None]:
     if chosen or not single or not settings.goal.learns or settings.train != "all":
         return opened, None
     dataset = opened.dataset.to(opened.device)
-    lost = forgotten(opened.whole, dataset, engine=opened.engine, seed=asked.seed)
+    lost = forgotten(opened.whole, dataset, engine=opened.engine, seed=asked.seed, say=_say)
     if lost is None:
         return opened, None
-    told = f"{STEPS} steps on half of the photographs change the others by {-lost:+.2f} dB"
+    told = f"they change the others by {-lost:+.2f} dB"
     if lost < BY_HEART:
-        _say(f"{told}: no dropout")
+        _say(f"{told}: it does not")
         return opened, lost
     ratio = isinstance(settings.goal, Fewer | Faster)  # to the fragments or frames of what is left
     keep = KEEP if asked.keep is None and not ratio else asked.keep
     options = f"--dropout {DROPOUT:g}" + (f" --keep {keep}" if keep else "")
-    _say(f"{told}: MODEL knows them by heart, so {options}")
+    _say(f"{told}: it does, so {options}")
     asked = replace(asked, keep=keep, settings=replace(settings, dropout=DROPOUT))
     return replace(opened, asked=asked), lost
 
