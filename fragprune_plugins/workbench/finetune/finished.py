@@ -179,7 +179,7 @@ class Finetuned:
                 f"photographs by heart, and learned with --dropout {settings.dropout:g}."
             )
         if self.keep is not None:
-            why = "whose removal changed the training views and those beside them least"
+            why = "those whose removal changed the training views and views beside them least"
             if self.keep == "visible":
                 why = f"which reached no pixel of the {views} views"
             lines.append(
