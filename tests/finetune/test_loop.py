@@ -68,6 +68,17 @@ def test_loss_falls_and_fragments_fall(default, model, dataset):
     assert [point.step for point in default.curves] == list(range(1, 61))
 
 
+@pytest.mark.parametrize("goal", [Control(), Pressure(1e-3)])
+def test_what_dropout_leaves_out_counts_before_learning(model, dataset, goal):
+    before = [
+        finetune(
+            model, dataset, Settings(iterations=1, goal=goal, dropout=share)
+        ).progress.fragments_before
+        for share in (None, 0.5)
+    ]
+    assert before[0] == before[1]
+
+
 def test_a_control_learns_without_thresholds_also_of_a_model_with_some(model, dataset):
     cut = tiny.cut(model, 0.3)
     result = finetune(cut, dataset, Settings(iterations=20, goal=Control()))

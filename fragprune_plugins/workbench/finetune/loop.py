@@ -272,12 +272,13 @@ class Training:
         inputs = RasterInputs(shot.view, splats, planes=(), **rules)
         thresholds = self.stage.thresholds(inputs)
 
-        outputs, plain = self.engine.rasterize(self.stage.dropped(inputs), thresholds), None
+        shown = self.stage.dropped(inputs)
+        outputs, plain = self.engine.rasterize(shown, thresholds), None
         if self._plain_first and self.processes.divided:  # another may need it, and all draw then
             plain = self._plain(inputs)
 
         def untruncated() -> RasterOutputs:
-            whole = thresholds is None and inputs.stop is None and not self.settings.dropout
+            whole = thresholds is None and inputs.stop is None and shown is inputs
             return outputs if whole else plain or self._plain(inputs)
 
         area = area_per_pixel(inputs) if self.settings.goal.on_area else None
