@@ -48,6 +48,21 @@ def test_what_holds_for_some_photographs_alone_is_forgotten(truth, photographs, 
     assert forgotten(truth, Dataset(shots, []), engine=engine) > 10 * BY_HEART
 
 
+def test_a_pruned_model_is_tried_with_its_cutoffs(model, photographs, engine):
+    cut, drawn = tiny.cut(model, 0.3), []
+
+    class Listening:
+        def rasterize(self, inputs, thresholds):
+            drawn.append(thresholds)
+            return engine.rasterize(inputs, thresholds)
+
+    forgotten(cut, photographs, engine=Listening())
+    whole = len(photographs.train[::2])  # a view's first visit counts its fragments without cutoffs
+    assert sum(each is None for each in drawn) == whole
+    assert all(torch.equal(each, cut.falloff) for each in drawn if each is not None)
+    assert len(drawn) > 100 + whole
+
+
 def test_few_photographs_tell_nothing(model, dataset, engine):
     assert len(dataset.train) == 7
     assert forgotten(model, dataset, engine=engine) is None
@@ -76,7 +91,7 @@ def command(tmp_path, monkeypatch):
     """Runs ``finetune`` with what a trial is to find; it fails if None and a trial is made."""
     data, path, _ = tiny.scene(tmp_path)
 
-    def tuned(found, *options):
+    def tuned(found, *options, model=path):
         def trial(*_, **__):
             assert found is not None, "nothing was to be tried"
             return found
@@ -84,7 +99,7 @@ def command(tmp_path, monkeypatch):
         monkeypatch.setattr(work, "forgotten", trial)
         out = tmp_path / "out.ply"
         return run_json(
-            "finetune", path, "--data", data, "--out", out, "--iters", 4, "--again", *options
+            "finetune", model, "--data", data, "--out", out, "--iters", 4, "--again", *options
         )
 
     return tuned
@@ -104,6 +119,13 @@ def test_the_trial_chooses_what_nobody_chose(command, found, options, dropout, k
     assert (report["settings"]["dropout"], report["keep"]) == (dropout, keep)
     assert report["forgotten"] == found
     assert report["after"]["gaussians"] == (keep or 1) * 60
+
+
+def test_of_a_pruned_model_no_gaussian_is_removed(command, tmp_path):
+    command(BY_HEART - 0.01)
+    pruned = (tmp_path / "out.ply").rename(tmp_path / "pruned.ply")
+    report = command(BY_HEART, model=pruned)
+    assert (report["settings"]["dropout"], report["keep"]) == (DROPOUT, None)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import torch
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.learning.goals import Control
+from fragprune_plugins.learning.goals import Control, Pressure
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.stage2 import evenly
 from fragprune_plugins.types import RasterInputs
@@ -44,7 +44,7 @@ def forgotten(
     is. What it has learned of the single photographs, such as their noise, they overwrite.
 
     Args:
-        model: drawn without thresholds; not changed.
+        model: not changed. One that is pruned already keeps its thresholds.
         dataset: its photographs, on the model's device.
         engine: draws.
         seed: of the order of views.
@@ -58,12 +58,12 @@ def forgotten(
         return None
     say(f"trying whether MODEL knows its photographs by heart: {STEPS} steps on half of them")
     learned, others = dataset.train[::2], evenly(dataset.train[1::2], _VIEWS)
-    whole = model.untruncated()
-    settings = Settings(iterations=STEPS, goal=Control(), seed=seed)
+    goal = Pressure(0.0) if model.falloff is not None else Control()
+    settings = Settings(iterations=STEPS, goal=goal, threshold_lr=0.0, stop=None, seed=seed)
     half = replace(dataset, train=learned)
-    training = Training(whole, half, settings, Schedule(settings), engine, _Unheard())
+    training = Training(model, half, settings, Schedule(settings), engine, _Unheard())
     training.learn(Keeper(None, training), progress=False)
-    return _psnr(whole, others, engine) - _psnr(training.result_model(), others, engine)
+    return _psnr(model, others, engine) - _psnr(training.result_model(), others, engine)
 
 
 class _Unheard(Alone):
@@ -78,6 +78,6 @@ def _psnr(model: Model, shots: Sequence[Shot], engine: Engine) -> float:
     splats, found = model.splats(), []
     for shot in shots:
         inputs = RasterInputs(shot.view, splats, planes=(), **model.rules)
-        image = shot.looked_at(engine.rasterize(inputs, None).image).clamp(0, 1)
+        image = shot.looked_at(engine.rasterize(inputs, model.falloff).image).clamp(0, 1)
         found.append(psnr(image, shot.image))
     return statistics.fmean(found)

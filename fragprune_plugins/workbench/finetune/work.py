@@ -164,7 +164,8 @@ def _tried(opened: _Opened) -> tuple[_Opened, float | None]:
         _say(f"{told}: it does not")
         return opened, lost
     ratio = isinstance(settings.goal, Fewer | Faster)  # to the fragments or frames of what is left
-    keep = KEEP if asked.keep is None and not ratio else asked.keep
+    whole = asked.keep is None and not ratio and opened.whole.falloff is None
+    keep = KEEP if whole else asked.keep
     options = f"--dropout {DROPOUT:g}" + (f" --keep {keep}" if keep else "")
     _say(f"{told}: it does, so {options}")
     asked = replace(asked, keep=keep, settings=replace(settings, dropout=DROPOUT))
