@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
+
+from torch import Tensor
 
 from fragprune_plugins.errors import NotComparedError
 from fragprune_plugins.hosts.photographs import Photographs
@@ -12,6 +15,23 @@ from fragprune_plugins.learning.events import Summary
 from fragprune_plugins.learning.schedule import Settings
 
 Stage = Literal["auto", "finetune", "joint", "off"]
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a look at the model of stage 1 found that stage 2 should do.
+
+    Attributes:
+        settings: to learn with.
+        kept: (N,) bool, the Gaussians that stage 2 begins with; None for all.
+    """
+
+    settings: Settings
+    kept: Tensor | None = None
+
+
+Look = Callable[[Path, Photographs, Settings], Found]
+"""Is given the PLY of stage 1, its photographs, and the settings that were asked for."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +53,8 @@ class RunOptions:
             result already, nothing runs. If an earlier run of the same command finished stage 1
             and not stage 2, "auto" begins with stage 2.
         trust: go on where the host's own rasterizer draws otherwise than our engine.
+        look: is called before stage 2 resumes a model whose PLY alone, by vanilla's rules, shows
+            what the host draws; None learns as asked.
     """
 
     adapter: str | None = None
@@ -43,6 +65,7 @@ class RunOptions:
     device: str = "auto"
     again: bool = True
     trust: bool = False
+    look: Look | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -28,7 +28,7 @@ from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import process, starting, workers
 from fragprune_plugins.injection.command import HostCommand
-from fragprune_plugins.injection.options import RunOptions, RunSummary
+from fragprune_plugins.injection.options import Found, RunOptions, RunSummary
 from fragprune_plugins.injection.session import Session
 from fragprune_plugins.injection.starting import Start
 from fragprune_plugins.learning.events import Summary
@@ -59,7 +59,7 @@ class Stages:
     already_finished: bool = False
 
     def __post_init__(self) -> None:
-        self.output = self.host.output
+        self.output, self.found = self.host.output, Found(self.options.settings)
 
     def observe(self) -> None:
         """Run the command unchanged; thresholds of sidecars apply, and nothing learns."""
@@ -176,12 +176,45 @@ class Stages:
                 self.around, self.output = self.output, self.output / own
             if self.output is not None and str(self.output) != self.host.flags.output:
                 extra["output"] = str(self.output)
-            if not self.options.again and self._is_finished(start, self._model(total)):
-                self.after, self.already_finished = self._model(total), True
+            known = None if self.options.again else self._finished(start, self._model(total))
+            if known is not None:
+                self.found, self.after, self.already_finished = known, self._model(total), True
                 return
+            self.found = self._look(checkpoint)
+            if self.found.kept is not None:
+                part = starting.part_of(checkpoint, self.found.kept, self.scratch)
+                extra["resume"] = str(part)
             arguments = self.host.saving(self.scratch, total, **extra)
-            self._execute(arguments, learn=True, start=first)
+            self._execute(arguments, learn=True, start=first, settings=self.found.settings)
             self.after = self._model(total)
+
+    def _look(self, checkpoint: Path) -> Found:
+        """What stage 2 does after a look at the model of stage 1; what was asked for without one.
+
+        Other rules of drawing than vanilla's are not known to whoever looks.
+
+        Args:
+            checkpoint: that the host resumes.
+        """
+        asked, look = Found(self.options.settings), self.options.look
+        if look is None or self.before is None:
+            return asked
+        try:
+            photographs = self.adapter.photographs(self.repo, self.host.arguments)
+            own_rules = self.adapter.drawing(self.repo, self.host.arguments)
+        except NotComparedError:
+            return asked
+        if own_rules:
+            return asked
+        if not starting.holds(checkpoint, self.before):
+            log.warning(
+                "%s has other Gaussians than %s, as where a host densifies in its last iteration: "
+                "stage 2 learns as asked, without a look at the model",
+                checkpoint,
+                self.before,
+            )
+            return asked
+        return look(self.before, photographs, asked.settings)
 
     def _execute(
         self,
@@ -229,16 +262,20 @@ class Stages:
                 self.learned = session.finish()
                 self.curves = session.curves
 
-    def _is_finished(self, start: Start, result: Path | None) -> bool:
-        """Whether stage 2 from this start wrote this file, with these settings."""
+    def _finished(self, start: Start, result: Path | None) -> Found | None:
+        """With what stage 2 wrote this file from this start, if that is what is asked for."""
         if result is None or start.path.stat().st_mtime_ns > result.stat().st_mtime_ns:
-            return False
+            return None
         try:
             _, info = sidecar.load(result)
         except SidecarError:
-            return False
-        asked = self.options.settings.as_dict(), self.adapter.name, self.repo.commit
-        return (info.settings, info.adapter, info.host_commit) == asked
+            return None
+        settings = self.options.settings
+        if settings.dropout is None:  # a look at the model chose it
+            settings = replace(settings, dropout=info.settings.get("dropout"))
+        asked = settings.as_dict(), self.adapter.name, self.repo.commit
+        written = info.settings, info.adapter, info.host_commit
+        return Found(settings) if written == asked else None
 
     def _interrupted(self, error: KeyboardInterrupt, saved: Path | None) -> Interrupted:
         """The error that reports Ctrl-C or SIGTERM, names the saved model, and says how to go on.
@@ -264,7 +301,7 @@ class Stages:
 
     def summary(self, seconds: float) -> RunSummary:
         """The summary, after all stages have ended."""
-        settings: dict[str, Any] = {"settings": self.options.settings.as_dict()}
+        settings: dict[str, Any] = {"settings": self.found.settings.as_dict()}
         learned = vars(self.learned) if self.learned else {"adapter": self.adapter.name}
         photographs, drawing, not_compared = self._comparison()
         return RunSummary(

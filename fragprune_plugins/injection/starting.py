@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from plyfile import PlyData
+from torch import Tensor
 
 from fragprune_plugins.errors import ModelFileError, UsageError
 from fragprune_plugins.files import sidecar
@@ -160,6 +162,60 @@ def resumable(adapter: ScriptAdapter, line: CommandLine, start: Start) -> Iterat
         yield made
     finally:
         made.unlink(missing_ok=True)
+
+
+def holds(start: Path, ply: Path) -> bool:
+    """Whether a file that the host can resume holds the Gaussians of a PLY of the same iteration.
+
+    Hosts write the PLY of an iteration before they densify in it, and the checkpoint after that.
+    """
+    if start.suffix == ".ply":
+        return True
+    rows = len(PlyData.read(ply)["vertex"].data)
+    return any(each.shape[:1] == (rows,) for each in _tensors(_read_checkpoint(start)[0]))
+
+
+def part_of(start: Path, kept: Tensor, folder: Path) -> Path:
+    """A copy of a file that the host can resume, with a part of its Gaussians.
+
+    Whatever has a row for each Gaussian keeps the rows of these: parameters, their moments,
+    statistics, and what else a fork counts.
+
+    Args:
+        start: a checkpoint, or a PLY.
+        kept: (N,) bool, over its N Gaussians.
+        folder: for the copy, which has the file's name.
+    """
+    target = folder / start.name
+    if start.suffix == ".ply":
+        ply = PlyData.read(start)
+        ply["vertex"].data = ply["vertex"].data[kept.numpy()]
+        ply.write(target)
+    else:
+        capture, iteration = _read_checkpoint(start)
+        torch.save((_rows(capture, kept), iteration), target)
+    return target
+
+
+def _tensors(held: Any) -> Iterator[Tensor]:
+    """Whatever tensors a checkpoint holds."""
+    if isinstance(held, Tensor):
+        yield held
+    elif isinstance(held, dict | list | tuple):
+        for each in held.values() if isinstance(held, dict) else held:
+            yield from _tensors(each)
+
+
+def _rows(held: Any, kept: Tensor) -> Any:
+    """What a checkpoint holds, of the Gaussians that are kept."""
+    if isinstance(held, dict):
+        return {name: _rows(each, kept) for name, each in held.items()}
+    if isinstance(held, list | tuple):
+        return type(held)(_rows(each, kept) for each in held)
+    if not isinstance(held, Tensor) or held.shape[:1] != kept.shape:
+        return held
+    rows = held.detach()[kept]
+    return torch.nn.Parameter(rows, held.requires_grad) if held.requires_grad else rows
 
 
 def _learned(path: Path) -> bool:

@@ -27,8 +27,8 @@ def test_a_host_run_loads_no_module_of_the_workbench(tmp_path, photographs, pyth
     assert not [name for name in OTHERS if name in loaded]
 
 
-def test_the_command_run_loads_of_the_workbench_what_measures(python):
-    """Of the slices its own alone."""
+def test_the_command_run_loads_of_the_workbench_what_measures_and_tries(python):
+    """Of the slices its own, and the training that is tried before stage 2."""
     ours = python(
         "import json, sys\n"
         "import fragprune_plugins.workbench.run.work\n"
@@ -36,4 +36,5 @@ def test_the_command_run_loads_of_the_workbench_what_measures(python):
         "names = {m[len(start):].split('.')[0] for m in sys.modules if m.startswith(start)}\n"
         "print(json.dumps(sorted(names)))"
     )
-    assert set(ours) <= {"run", "commands", "figures", "goals", "models", "scenes", "ranks"}
+    measures = {"run", "commands", "figures", "goals", "models", "scenes", "ranks"}
+    assert set(ours) <= measures | {"finetune", "pruning"}

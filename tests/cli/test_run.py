@@ -11,12 +11,13 @@ from miniatures.runs import TINY
 from miniatures.vanilla_3dgs import HOST
 
 from fragprune_plugins import load
-from fragprune_plugins.errors import UsageError
+from fragprune_plugins.errors import ModelFileError, UsageError
 from fragprune_plugins.files import records
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import launch
 from fragprune_plugins.learning.schedule import USUAL_STOP
 from fragprune_plugins.testing import mutations
+from fragprune_plugins.workbench.finetune import trial
 
 WORDS = ["--device", "cpu", "--iters", 6]
 
@@ -149,6 +150,39 @@ def test_a_finished_stage_two_says_so_and_runs_nothing(folder):
     assert f"fragprune compare {models(out)[0]} {result}" in text.stdout
     assert result.stat().st_mtime_ns == written
     assert ran(*finetune, "--pressure", 2e-3, *words)["already_finished"] is False
+
+
+def test_a_model_that_knows_its_photographs_by_heart_is_told_and_learns_otherwise(
+    scene, tmp_path, monkeypatch
+):
+    out = tmp_path / "out"
+    words = command(scene, out, "--densify_until_iter", 8)
+    monkeypatch.setattr(trial, "forgotten", lambda *_, **__: trial.BY_HEART)
+    result = run("run", *WORDS, *words)
+    assert result.exit_code == 0, result.stderr
+    whole = len(load(models(out)[0]))
+    kept = len(load(models(out)[1]))
+    assert kept == round(whole * trial.KEEP)
+    assert f"Removed {whole - kept} of {whole} Gaussians before learning" in result.stdout
+    assert f"learned with --dropout {trial.DROPOUT:g}" in result.stdout
+    (record,) = records.find(out)
+    assert (record.data["keep"], record.data["forgotten"]) == (trial.KEEP, trial.BY_HEART)
+    assert record.data["settings"]["dropout"] == trial.DROPOUT
+    asked = ran("--stage", "finetune", "--dropout", 0, *WORDS, *words)
+    assert (asked["gaussians"], asked["keep"], asked["forgotten"]) == (whole, None, None)
+
+
+def test_where_nothing_can_be_tried_stage_two_learns_as_asked(
+    scene, tmp_path, monkeypatch, caplog
+):
+    def fail(*_, **__):
+        raise ModelFileError("out", "a stand-in", "something else", "Nothing.")
+
+    monkeypatch.setattr(trial, "forgotten", fail)
+    result = run("run", *WORDS, *command(scene, tmp_path / "out", "--densify_until_iter", 8))
+    assert result.exit_code == 0, result.stderr
+    assert "not tried whether it knows its photographs by heart, because of" in caplog.text
+    assert "Removed" not in result.stdout
 
 
 @pytest.mark.parametrize(("size", "read"), [("16", (16, 12)), ("-1", (40, 30))])

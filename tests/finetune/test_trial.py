@@ -10,7 +10,7 @@ from finetune import tiny
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import installed
-from fragprune_plugins.workbench.finetune import work
+from fragprune_plugins.workbench.finetune import trial
 from fragprune_plugins.workbench.finetune.trial import BY_HEART, DROPOUT, KEEP, forgotten
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 
@@ -92,11 +92,11 @@ def command(tmp_path, monkeypatch):
     data, path, _ = tiny.scene(tmp_path)
 
     def tuned(found, *options, model=path):
-        def trial(*_, **__):
+        def stand_in(*_, **__):
             assert found is not None, "nothing was to be tried"
             return found
 
-        monkeypatch.setattr(work, "forgotten", trial)
+        monkeypatch.setattr(trial, "forgotten", stand_in)
         out = tmp_path / "out.ply"
         return run_json(
             "finetune", model, "--data", data, "--out", out, "--iters", 4, "--again", *options

@@ -220,6 +220,29 @@ def next_steps(model: Path | None, folder: Path, scene: Path | None = None) -> s
     return f"{look}A page to share: fragprune report {folder}{data}"
 
 
+def begun(data: dict[str, Any], removed: int, views: int = 0) -> list[str]:
+    """Lines on what came before the first step of a fine-tuning: its trial, and Gaussians removed.
+
+    Args:
+        data: its figures, with "settings", "before", "keep" and "forgotten".
+        removed: number of Gaussians.
+        views: that were looked at for --keep visible.
+    """
+    lines, dropout, keep = [], data["settings"]["dropout"], data["keep"]
+    if data["forgotten"] is not None and dropout:
+        lines.append(
+            f"A trial made other photographs {data['forgotten']:.2f} dB worse, so the model knew "
+            f"its photographs by heart, and learned with --dropout {dropout:g}."
+        )
+    if keep is not None:
+        why = "those whose removal changed the training views and views beside them least"
+        if keep == "visible":
+            why = f"which reached no pixel of the {views} views"
+        whole = data["before"]["gaussians"]
+        lines.append(f"Removed {removed:,} of {whole:,} Gaussians before learning, {why}.")
+    return lines
+
+
 def missed(data: dict[str, Any]) -> str:
     """That a fine-tuning missed its target, a sentence with a space before it; else nothing."""
     if data.get("target_reached") is not False:

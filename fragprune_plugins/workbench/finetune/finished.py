@@ -18,6 +18,7 @@ from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
 from fragprune_plugins.workbench.figures.wording import (
     FELL,
     ITSELF,
+    begun,
     describe,
     next_steps,
     outcome,
@@ -173,19 +174,7 @@ class Finetuned:
         if result.interrupted:
             of = f"{data['iterations']} of {settings.iterations}"
             lines.append(f"Interrupted at {of} iterations. {_goes_on(self.found)}")
-        if self.forgotten is not None and settings.dropout:
-            lines.append(
-                f"A trial made other photographs {self.forgotten:.2f} dB worse, so MODEL knew its "
-                f"photographs by heart, and learned with --dropout {settings.dropout:g}."
-            )
-        if self.keep is not None:
-            why = "those whose removal changed the training views and views beside them least"
-            if self.keep == "visible":
-                why = f"which reached no pixel of the {views} views"
-            lines.append(
-                f"Removed {self.removed:,} of {len(self.start.model):,} Gaussians before learning, "
-                f"{why}."
-            )
+        lines += begun(data, self.removed, views)
         plain = data["untruncated"]
         if plain is not None:
             lines.append(describe_untruncated(before, plain))

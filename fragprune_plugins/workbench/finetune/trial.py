@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.learning.goals import Control, Pressure
+from fragprune_plugins.learning.goals import Control, Fewer, Pressure
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.stage2 import evenly
 from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.figures.metrics import psnr
 from fragprune_plugins.workbench.finetune.loop import Alone, Training
 from fragprune_plugins.workbench.finetune.resuming import Keeper
+from fragprune_plugins.workbench.goals import AtMost, Faster
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 
 DROPOUT, KEEP = 0.2, 0.6
@@ -25,9 +27,68 @@ DROPOUT, KEEP = 0.2, 0.6
 BY_HEART = 0.2
 """dB that a model forgets in a trial if it knows its photographs by heart; others 0.05 at most."""
 
+Keep = float | Literal["auto", "visible"] | None
+"""The Gaussians that a training begins with: a share, a rule (``--keep``), or all."""
+
 STEPS = 100
 _VIEWS = 24  # to measure on
 _FEWEST = 8  # photographs, to tell anything
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What a training does, after a trial or without one.
+
+    Attributes:
+        settings: to learn with.
+        keep: the Gaussians to begin with.
+        forgotten: what the trial found, see ``forgotten``; None without one.
+    """
+
+    settings: Settings
+    keep: Keep = None
+    forgotten: float | None = None
+
+
+def tried(
+    model: Model,
+    dataset: Dataset,
+    settings: Settings,
+    keep: Keep = None,
+    *,
+    engine: Engine,
+    say: Callable[[str], None],
+) -> Trial:
+    """Make a trial where nobody chose a dropout, and choose what suits a model of its kind.
+
+    One that knows its photographs by heart learns with dropout, and without four in ten Gaussians
+    unless somebody chose which: but with all that it has if it was pruned before, or if a target is
+    a ratio to what it began with.
+
+    Args:
+        model: not changed.
+        dataset: its photographs, on the model's device.
+        settings: that were asked for.
+        keep: that was asked for.
+        engine: draws.
+        say: is told what is tried, and what came of it, in a sentence each.
+    """
+    chosen = settings.dropout is not None or settings.itself or settings.train != "all"
+    asked = Trial(settings, keep)
+    if chosen or not settings.goal.learns or isinstance(settings.goal, AtMost):
+        return asked
+    lost = forgotten(model, dataset, engine=engine, seed=settings.seed, say=say)
+    if lost is None:
+        return asked
+    told = f"they change the others by {-lost:+.2f} dB"
+    if lost < BY_HEART:
+        say(f"{told}: it does not")
+        return replace(asked, forgotten=lost)
+    whole = model.falloff is None and not isinstance(settings.goal, Fewer | Faster)
+    keep = KEEP if keep is None and whole else keep
+    options = f"--dropout {DROPOUT:g}" + (f" --keep {keep}" if keep else "")
+    say(f"{told}: it does, so {options}")
+    return Trial(replace(settings, dropout=DROPOUT), keep, lost)
 
 
 def forgotten(

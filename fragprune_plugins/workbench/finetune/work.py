@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import click
 
@@ -14,7 +14,6 @@ from fragprune_plugins.engines.cpu.memory import keep_freed_memory
 from fragprune_plugins.files.atomic import locked
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs
-from fragprune_plugins.learning.goals import Fewer
 from fragprune_plugins.learning.interruption import sigterm_interrupts
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.workbench.commands.command import Report
@@ -33,8 +32,8 @@ from fragprune_plugins.workbench.finetune.finished import Finetuned
 from fragprune_plugins.workbench.finetune.result import FinetuneResult
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
 from fragprune_plugins.workbench.finetune.searching import Bounded, strongest
-from fragprune_plugins.workbench.finetune.trial import BY_HEART, DROPOUT, KEEP, forgotten
-from fragprune_plugins.workbench.goals import AtMost, Faster
+from fragprune_plugins.workbench.finetune.trial import Keep, tried
+from fragprune_plugins.workbench.goals import AtMost
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.models.written import require_place
 from fragprune_plugins.workbench.pruning.scores import keep_best, keep_needed
@@ -54,7 +53,7 @@ class Asked:
     cameras: Path | None
     scene: SceneOptions
     settings: Settings
-    keep: float | Literal["auto", "visible"] | None
+    keep: Keep
     seed: int
     shard: bool
     no_truncation: bool
@@ -146,30 +145,16 @@ def _finished(opened: _Opened) -> Report | None:
 
 
 def _tried(opened: _Opened) -> tuple[_Opened, float | None]:
-    """What a trial found, and the same with what it chose: dropout, and a share to keep.
+    """What a trial found, and the same with what it chose: dropout, and Gaussians to keep.
 
-    It is made where nobody chose a dropout. In several processes the trials would have to agree.
+    In several processes the trials would have to agree, so none is made.
     """
-    asked, settings = opened.asked, opened.asked.settings
-    chosen = settings.dropout is not None or asked.itself
-    single = not isinstance(settings.goal, AtMost) and launched().size == 1
-    if chosen or not single or not settings.goal.learns or settings.train != "all":
+    if launched().size > 1:
         return opened, None
-    dataset = opened.dataset.to(opened.device)
-    lost = forgotten(opened.whole, dataset, engine=opened.engine, seed=asked.seed, say=_say)
-    if lost is None:
-        return opened, None
-    told = f"they change the others by {-lost:+.2f} dB"
-    if lost < BY_HEART:
-        _say(f"{told}: it does not")
-        return opened, lost
-    ratio = isinstance(settings.goal, Fewer | Faster)  # to the fragments or frames of what is left
-    whole = asked.keep is None and not ratio and opened.whole.falloff is None
-    keep = KEEP if whole else asked.keep
-    options = f"--dropout {DROPOUT:g}" + (f" --keep {keep}" if keep else "")
-    _say(f"{told}: it does, so {options}")
-    asked = replace(asked, keep=keep, settings=replace(settings, dropout=DROPOUT))
-    return replace(opened, asked=asked), lost
+    asked, dataset = opened.asked, opened.dataset.to(opened.device)
+    trial = tried(opened.whole, dataset, asked.settings, asked.keep, engine=opened.engine, say=_say)
+    asked = replace(asked, settings=trial.settings, keep=trial.keep)
+    return replace(opened, asked=asked), trial.forgotten
 
 
 def _learned(opened: _Opened, ranks: Ranks, lost: float | None) -> tuple[Finetuned, Engine]:

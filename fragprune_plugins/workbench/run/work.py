@@ -22,13 +22,16 @@ from fragprune_plugins.workbench.commands.opening import bound_threads, open_eng
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
 from fragprune_plugins.workbench.figures.wording import (
+    begun,
     describe,
     fewer,
     missed,
     next_steps,
     outcome,
 )
+from fragprune_plugins.workbench.finetune.trial import Trial
 from fragprune_plugins.workbench.models.model import load
+from fragprune_plugins.workbench.run.looking import Looking
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
 
 _WHERE = {"joint": "inside the training"}
@@ -53,6 +56,7 @@ def run(
     """Do what ``fragprune run`` promises; its options are the arguments."""
     bound_threads(engine.threads)
     logging.basicConfig(level=logging.INFO, format="fragprune: %(message)s", stream=sys.stderr)
+    looking = Looking(engine)
     options = launch.RunOptions(
         adapter=adapter,
         stage=stage,
@@ -62,6 +66,7 @@ def run(
         device=engine.device,
         again=again,
         trust=trust,
+        look=looking,
     )
     before = after = None
     # A host prints to stdout; with --json, stdout gets only our object.
@@ -79,7 +84,7 @@ def run(
                     before = first[0] if first else None
             except FragpruneError as error:  # the trained model is saved already
                 not_compared = error
-    data = _figures(summary, settings, before, after, not_compared)
+    data = _figures(summary, settings, looking.trial, before, after, not_compared)
     if summary.steps and summary.model_after:
         more = {"curves": summary.curves, "photographs": photographs}
         records.leave(summary.model_after, "run", data | more)
@@ -89,6 +94,7 @@ def run(
 def _figures(
     summary: launch.RunSummary,
     settings: Settings,
+    trial: Trial | None,
     before: dict[str, Any] | None,
     after: dict[str, Any] | None,
     not_compared: FragpruneError | None,
@@ -110,6 +116,8 @@ def _figures(
         "not_compared": not_compared and not_compared.as_dict(),
         "model_before": _text(summary.model_before),
         "model_after": _text(summary.model_after),
+        "keep": trial and trial.keep,
+        "forgotten": trial and trial.forgotten,
         "pressure": summary.curves[-1]["pressure"] if summary.curves else None,
         "train_seconds": summary.train_seconds,
         "target_reached": summary.target_reached,
@@ -177,6 +185,7 @@ def _describe(
     if data["before"]:
         columns = {"original": data["before"], "pruned": data["after"]}
         lines += [describe(columns), "", outcome("run", data, data["control"])]
+        lines += begun(data, data["before"]["gaussians"] - data["after"]["gaussians"])
     else:
         if data["after"]:
             lines += [describe({"after": data["after"]}), "", _CONTROL]

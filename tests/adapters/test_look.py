@@ -1,0 +1,161 @@
+"""A look at the model of stage 1: stage 2 begins with what it finds, and learns as it says."""
+
+import logging
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from miniatures import runs
+from miniatures.hosts import HOSTS
+from miniatures.runs import FROZEN, OPTIONS
+from plyfile import PlyData
+
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.ply import read_ply
+from fragprune_plugins.injection.launch import run
+from fragprune_plugins.injection.options import Found
+from fragprune_plugins.injection.starting import part_of
+from fragprune_plugins.learning.goals import Control
+
+ENDED = ("--densify_until_iter", 8)
+"""Before the last iteration, as in every training that ends."""
+
+RESUMED = {
+    "vanilla-3dgs": ENDED,
+    "3dgs-fork": ENDED,
+    "mcmc": (*ENDED, "--cap_max", 170),
+    "speedy-splat": (*ENDED, "--prune_until_iter", 0),
+}
+"""Hosts, and words that their commands need besides."""
+
+
+class Looked:
+    """Keeps every second Gaussian, and remembers what it was shown."""
+
+    def __init__(self):
+        self.seen = []
+
+    def __call__(self, ply, photographs, settings):
+        self.seen.append((ply, photographs, settings))
+        kept = torch.arange(len(read_ply(ply).xyz)) % 2 == 0
+        return Found(replace(settings, dropout=0.25), kept)
+
+
+@pytest.fixture(scope="module")
+def stage_one(photographs, tmp_path_factory):
+    """A finished stage 1 of vanilla, of ten iterations, and its command."""
+    folder = tmp_path_factory.mktemp("host")
+    script, out = runs.written(HOSTS["vanilla-3dgs"], folder) / "train.py", folder / "out"
+    words = runs.command(script, photographs, out, 10, *ENDED, "--checkpoint_iterations", 10)
+    run(words, replace(OPTIONS, stage="off"))
+    return words, out
+
+
+@pytest.fixture
+def trained(stage_one, tmp_path):
+    """The command in a copy of its output folder."""
+    words, out = stage_one
+    copy = Path(shutil.copytree(out, tmp_path / "out"))
+    return [str(copy) if word == str(out) else word for word in words]
+
+
+@pytest.mark.parametrize("host", RESUMED)
+def test_stage_two_begins_with_the_gaussians_that_are_kept(host, photographs, tmp_path):
+    folder, look = runs.written(HOSTS[host], tmp_path / "host"), Looked()
+    (script,) = folder.glob("train*.py")
+    words = runs.command(script, photographs, tmp_path / "out", 10, *RESUMED[host])
+    summary = run(words, replace(OPTIONS, look=look))
+    assert [seen[0] for seen in look.seen] == [summary.model_before]
+    before, after = read_ply(summary.model_before), read_ply(summary.model_after)
+    for name in FROZEN:
+        assert torch.equal(getattr(after, name), getattr(before, name)[::2]), name
+    store, info = sidecar.load(summary.model_after)
+    assert len(store) == summary.gaussians == len(after.xyz)
+    assert info.settings["dropout"] == summary.settings["dropout"] == 0.25
+
+
+def test_a_training_that_saved_a_ply_alone_begins_with_them_too(trained):
+    out = Path(trained[trained.index("-m") + 1])
+    (out / "chkpnt10.pth").unlink()
+    whole = {path: path.read_bytes() for path in out.rglob("*.p*")}
+    summary = run(trained, replace(OPTIONS, stage="finetune", look=Looked()))
+    assert torch.equal(read_ply(summary.model_after).xyz, read_ply(summary.model_before).xyz[::2])
+    assert {path: path.read_bytes() for path in whole} == whole
+
+
+def test_a_stage_two_that_a_look_changed_is_finished_when_asked_again(trained):
+    options = replace(OPTIONS, stage="finetune", again=False, look=Looked())
+    assert run(trained, options).steps == 8
+    again = replace(options, look=Looked())
+    finished = run(trained, again)
+    assert finished.already_finished
+    assert finished.settings["dropout"] == 0.25
+    assert again.look.seen == []
+    other = replace(options, settings=replace(options.settings, dropout=0.5))
+    assert not run(trained, other).already_finished
+
+
+def test_nobody_looks_before_other_rules_of_drawing(photographs, tmp_path):
+    script, look = runs.written(HOSTS["mip-splatting"], tmp_path / "host") / "train.py", Looked()
+    run(runs.command(script, photographs, tmp_path / "out", 10), replace(OPTIONS, look=look))
+    assert look.seen == []
+
+
+def test_a_checkpoint_with_other_gaussians_than_the_ply_is_resumed_whole(
+    photographs, tmp_path, caplog
+):
+    """The host densifies in the iteration in which it writes both."""
+    script, look = runs.written(HOSTS["vanilla-3dgs"], tmp_path / "host") / "train.py", Looked()
+    words = runs.command(script, photographs, tmp_path / "out", 10)
+    with caplog.at_level(logging.WARNING, logger="fragprune"):
+        summary = run(words, replace(OPTIONS, look=look))
+    assert look.seen == []
+    assert "without a look at the model" in caplog.text
+    assert summary.gaussians > len(read_ply(summary.model_before).xyz)
+
+
+def test_a_control_is_looked_at_as_its_training_is(trained):
+    control = replace(OPTIONS.settings, goal=Control())
+    options = replace(OPTIONS, stage="finetune", settings=control, look=Looked())
+    run(trained, options)
+    assert [settings.goal for *_, settings in options.look.seen] == [control.goal]
+
+
+def test_a_part_of_a_checkpoint_has_the_rows_of_its_gaussians(stage_one, tmp_path):
+    _, out = stage_one
+    whole, iteration = torch.load(out / "chkpnt10.pth", weights_only=False)
+    kept = torch.arange(len(whole[1])) % 3 == 0
+    part, same = torch.load(part_of(out / "chkpnt10.pth", kept, tmp_path), weights_only=False)
+    assert same == iteration
+    rows = len(kept)
+    for one, other in zip(leaves(whole), leaves(part), strict=True):
+        assert type(one) is type(other)
+        if torch.is_tensor(one) and one.shape[:1] == (rows,):
+            assert torch.equal(other, one[kept])
+            assert other.requires_grad == one.requires_grad
+        elif torch.is_tensor(one):
+            assert torch.equal(other, one)
+        else:
+            assert other == one
+    counted = [each for each in leaves(part) if torch.is_tensor(each) and len(each.shape) > 1]
+    assert len(counted) >= 3 * 6  # six parameters and two moments of each
+
+
+def test_a_part_of_a_ply_has_all_its_columns(stage_one, tmp_path):
+    ply = stage_one[1] / "point_cloud/iteration_10/point_cloud.ply"
+    whole = PlyData.read(ply)["vertex"].data
+    kept = torch.arange(len(whole)) % 3 == 0
+    part = PlyData.read(part_of(ply, kept, tmp_path))["vertex"].data
+    assert part.dtype == whole.dtype
+    assert np.array_equal(part, whole[kept.numpy()])
+
+
+def leaves(value):
+    if isinstance(value, dict):
+        return [leaf for each in value.values() for leaf in leaves(each)]
+    if isinstance(value, list | tuple):
+        return [leaf for each in value for leaf in leaves(each)]
+    return [value]
