@@ -104,7 +104,7 @@ _OPTIONS = (
         metavar="SHARE",
         help="Leave so many of the Gaussians out of a step, others in each, such as 0.2; falls to "
         "0 over the run. For a model that knows its photographs by heart. Default: 0, but "
-        "finetune tries whether MODEL is such a one.",
+        "finetune, and run before stage 2, try whether the model is such a one.",
     ),
     click.option(
         "--control",

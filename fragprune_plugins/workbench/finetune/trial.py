@@ -117,7 +117,7 @@ def forgotten(
     """
     if len(dataset.train) < _FEWEST:
         return None
-    say(f"trying whether MODEL knows its photographs by heart: {STEPS} steps on half of them")
+    say(f"trying whether the model knows its photographs by heart: {STEPS} steps on half of them")
     learned, others = dataset.train[::2], evenly(dataset.train[1::2], _VIEWS)
     goal = Pressure(0.0) if model.falloff is not None else Control()
     settings = Settings(iterations=STEPS, goal=goal, threshold_lr=0.0, stop=None, seed=seed)
