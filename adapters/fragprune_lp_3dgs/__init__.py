@@ -90,7 +90,7 @@ class LP3DGS(GraphdecoAdapter):
             "--prune_method compact_3dgs: its model has groups of its own and is refused.",
             "--prune_method rad_splat: pruning needs the host's own rasterizer; stage 2 does not.",
             "After a training of other than 30,000 iterations the host saves, then ends in a "
-            "KeyError: begin stage 2 with --stage finetune.",
+            "KeyError: the run says so, and goes on to stage 2.",
         ),
     )
     calls = (RasterizerCall(frozenset(SCORES), None),)

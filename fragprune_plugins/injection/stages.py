@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import sys
+import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -75,15 +76,14 @@ class Stages:
         steps = total - resumed - self.host.line.skipped
         settings = replace(self.options.settings, iterations=steps)
         schedule = JointSchedule(settings, start - resumed + 1)
-        self._execute(
-            self.host.saving(self.scratch, total),
-            learn=True,
+        self._learn(
+            total,
+            self.host.saving(self.scratch, total, **self._apart()),
             freeze=False,
             start=resumed,
             schedule=schedule,
             settings=settings,
         )
-        self.after = self._model(total)
 
     def train_then_finetune(self) -> None:
         """Run stage 1 with a checkpoint at its end, then stage 2 from that checkpoint."""
@@ -109,20 +109,31 @@ class Stages:
         arguments = self.host.with_flags(self.scratch, save_checkpoints=written)
         files = starting.files(self.adapter, self.output)
         earlier = {path: path.stat().st_mtime_ns for _, path in files}
-        self._execute(arguments, learn=False)
-        ends = [
-            (path.suffix != ".ply", path)
-            for iteration, path in starting.files(self.adapter, self.output)
-            if iteration == total and earlier.get(path) != path.stat().st_mtime_ns
-        ]
-        if not ends:  # some hosts refuse a command with exit code 0
+
+        def end() -> Path | None:
+            ends = [
+                (path.suffix != ".ply", path)
+                for iteration, path in starting.files(self.adapter, self.output)
+                if iteration == total and earlier.get(path) != path.stat().st_mtime_ns
+            ]
+            return max(ends)[1] if ends else None
+
+        try:
+            self._execute(arguments, learn=False)
+        except HostFailed as error:
+            if (saved := end()) is None:
+                raise
+            log.warning(
+                "the host had saved %s when it failed, and stage 2 goes on: %s", saved, error
+            )
+        if (saved := end()) is None:  # some hosts refuse a command with exit code 0
             raise HostFailed(
                 self.host.script.name,
                 f"ended without a checkpoint of iteration {total}",
                 "a training that runs to its end",
                 "Read the host's own message above.",
             )
-        return Start(total, max(ends)[1], "the end of stage 1")
+        return Start(total, saved, "the end of stage 1")
 
     def one_run(self) -> None:
         """Run a host that cannot resume once, longer; stage 2 begins where it would have ended."""
@@ -130,13 +141,10 @@ class Stages:
         last = total + settings.iterations + self.host.line.skipped
         log.info("one run of %d iterations; stage 2 begins after %d", last, total)
         arguments = self.adapter.lengthened(self.host.arguments, total, last)
-        if (
-            not settings.goal.presses and self.output is not None
-        ):  # keeps a learned result in its place
-            self.output /= "control"
-            arguments += [self.host.line.output[-1], str(self.output)]
-        self._execute(arguments, learn=True, from_step=total, settings=settings)
-        self.before, self.after = self._model(total), self._model(last)
+        for folder in self._apart().values():
+            arguments += [self.host.line.output[-1], folder]
+        self._learn(last, arguments, from_step=total, settings=settings)
+        self.before = self._model(total)
 
     def finetune(self) -> None:
         """Run stage 2: resume a model, or begin at ``from_iter`` of one run."""
@@ -144,14 +152,13 @@ class Stages:
         if self.options.from_iter is not None:
             resumed, begins, total = self._learning(self.options.from_iter)
             steps = total - begins - self.host.line.skipped
-            self._execute(
-                self.host.saving(self.scratch, total),
-                learn=True,
+            self._learn(
+                total,
+                self.host.saving(self.scratch, total, **self._apart()),
                 from_step=begins - resumed,
                 start=resumed,
                 settings=replace(settings, iterations=steps),
             )
-            self.after = self._model(total)
             return
         if self.host.line.one_run:
             raise UsageError(
@@ -170,12 +177,7 @@ class Stages:
             first = 0 if line.restarts else start.iteration
             total = first + settings.iterations + line.skipped
             extra = {"iterations": total, "resume": str(checkpoint)}
-            own = "finetuned" if line.restarts else ""
-            own = own if settings.goal.presses else "control"  # keeps a learned result in its place
-            if own and self.output is not None:
-                self.around, self.output = self.output, self.output / own
-            if self.output is not None and str(self.output) != self.host.flags.output:
-                extra["output"] = str(self.output)
+            extra |= self._apart("finetuned" if line.restarts else "")
             known = None if self.options.again else self._finished(start, self._model(total))
             if known is not None:
                 self.found, self.after, self.already_finished = known, self._model(total), True
@@ -185,8 +187,34 @@ class Stages:
                 part = starting.part_of(checkpoint, self.found.kept, self.scratch)
                 extra["resume"] = str(part)
             arguments = self.host.saving(self.scratch, total, **extra)
-            self._execute(arguments, learn=True, start=first, settings=self.found.settings)
-            self.after = self._model(total)
+            self._learn(total, arguments, start=first, settings=self.found.settings)
+
+    def _apart(self, own: str = "") -> dict[str, str]:
+        """Save what learns in a folder of its own in the output folder, where it needs one.
+
+        Args:
+            own: the folder's name. A control always has one, so a learned result keeps its place.
+
+        Returns:
+            The flag for the host, by field of ``CommandLine``, if its command names another folder.
+        """
+        own = own if self.options.settings.goal.presses else "control"
+        if own and self.output is not None:
+            self.around, self.output = self.output, self.output / own
+        return {} if self.output == self.host.output else {"output": str(self.output)}
+
+    def _learn(self, last: int, arguments: list[str], **options: Any) -> None:
+        """Run the host's script with learning on; the result is its model of iteration ``last``."""
+        started = time.time()
+        try:
+            self._execute(arguments, learn=True, **options)
+        except HostFailed as error:
+            saved = self._model(last)
+            if saved is None or saved.stat().st_mtime < started:
+                raise
+            remedy = f"{error.remedy} The learned model was saved: {saved}"
+            raise HostFailed(error.where, error.found, error.expected, remedy) from error
+        self.after = self._model(last)
 
     def _look(self, checkpoint: Path) -> Found:
         """What stage 2 does after a look at the model of stage 1; what was asked for without one.
@@ -236,7 +264,7 @@ class Stages:
             prove=self.options.stage != "off",
             trust=self.options.trust,
             output=self.output,
-            origin=self.around,
+            origin=self.around if self.start or options.get("start") else None,
             **options,
         )
         known, host = set(sys.modules), self.host
@@ -331,7 +359,7 @@ class Stages:
                     f"--stage {self.options.stage}",
                     f"no model from {'before' if self.after else 'after'} the learning",
                     "a model that the host saved",
-                    "Name two models to fragprune compare.",
+                    "Have the host save its model before and after.",
                 )
             return self.adapter.photographs(self.repo, self.host.arguments), drawing, None
         except NotComparedError as error:

@@ -123,6 +123,44 @@ def test_a_page_is_advised_only_of_a_model_that_view_shows(
     assert f"fragprune report {tmp_path}" in said
 
 
+@pytest.mark.parametrize(
+    "learning",
+    [("--stage", "joint", "--from-iter", 12), ("--stage", "finetune", "--from-iter", 12)],
+    ids=["joint", "one run"],
+)
+def test_a_control_inside_one_training_lies_beside_the_result_too(scene, tmp_path, learning):
+    out = tmp_path / "out"
+    words = ["--device", "cpu", *learning]
+    training = command(scene, out, "--iterations", 16)
+    ran(*words, *training)
+    kept = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    zero = run("run", *words, "--control", *training)
+    assert f"Model: {out / 'control'}" in zero.stdout
+    assert {path: path.read_bytes() for path in kept} == kept
+    assert "fragprune compare" not in zero.stdout  # there is no second model
+
+
+def test_the_table_of_a_control_calls_nothing_pruned(folder):
+    out, scene = folder
+    words = ["--stage", "finetune", *WORDS, "--control", *command(scene, out, "-r", 2)]
+    result = run("run", *words)
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout.split("\n")[0].split() == ["original", "control", "change"]
+    run("report", out / "control")
+    page = (out / "control/report.html").read_text()
+    assert '<th scope="col">control' in page
+    assert ">pruned<" not in page
+
+
+def test_compare_is_advised_of_nothing_that_was_not_measured(folder):
+    out, scene = folder
+    (record,) = records.find(out)
+    records.leave(models(out)[1], "run", record.data | {"before": None})
+    result = run("run", "--stage", "finetune", *WORDS, *command(scene, out, "-r", 2))
+    assert "is finished" in result.stdout
+    assert "fragprune compare" not in result.stdout
+
+
 def test_a_control_lies_beside_the_result_and_is_quoted_with_it(folder):
     out, scene = folder
     finetune = ["--stage", "finetune", *WORDS]
@@ -172,9 +210,7 @@ def test_a_model_that_knows_its_photographs_by_heart_is_told_and_learns_otherwis
     assert (asked["gaussians"], asked["keep"], asked["forgotten"]) == (whole, None, None)
 
 
-def test_where_nothing_can_be_tried_stage_two_learns_as_asked(
-    scene, tmp_path, monkeypatch, caplog
-):
+def test_where_nothing_can_be_tried_stage_two_learns_as_asked(scene, tmp_path, monkeypatch, caplog):
     def fail(*_, **__):
         raise ModelFileError("out", "a stand-in", "something else", "Nothing.")
 

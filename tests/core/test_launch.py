@@ -357,6 +357,40 @@ def test_stage_one_is_repeated_where_it_is_not_known_to_be_the_same(
     assert first.endswith("[12345] None")
 
 
+FAILS_AFTERWARDS = """
+if not args.start_checkpoint:
+    raise KeyError("ours_30000")  # an evaluation that looks for another iteration
+"""
+
+
+def test_a_training_whose_evaluation_fails_goes_on_to_stage_two(host, tmp_path, caplog):
+    out = tmp_path / "out"
+    run([host(STAGES + FAILS_AFTERWARDS), "-m", str(out)], AUTO)
+    checkpoint = out / "chkpnt12345.pth"
+    assert (out / "log").read_text().splitlines()[1] == f"17346 [] {checkpoint}"
+    (said,) = (each.message for each in caplog.records if "ours_30000" in each.message)
+    assert f"had saved {checkpoint} when it failed" in said
+
+
+def test_a_training_that_fails_before_its_last_checkpoint_fails(host, tmp_path):
+    early = STAGES.replace("for iteration", "raise KeyError('early')\nfor iteration")
+    with pytest.raises(HostFailed, match="early"):
+        run([host(early), "-m", str(tmp_path / "out")], AUTO)
+
+
+def test_a_stage_two_that_fails_after_it_saved_names_the_model(host, tmp_path):
+    ply = "point_cloud/iteration_17346/point_cloud.ply"
+    saves = f"""
+if args.start_checkpoint:
+    (out / "{ply}").parent.mkdir(parents=True)
+    (out / "{ply}").touch()
+    raise KeyError("ours_30000")
+"""
+    with pytest.raises(HostFailed, match="ours_30000") as caught:
+        run([host(STAGES + saves), "-m", str(tmp_path / "out")], AUTO)
+    assert f"learned model was saved: {tmp_path / 'out' / ply}" in caught.value.remedy
+
+
 def test_after_ctrl_c_a_folder_that_only_the_host_named_is_named(host, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     host(SCENE, "scene/__init__.py")

@@ -54,6 +54,13 @@ _DIFFERENCES = ("psnr", "ssim", "lpips")
 """Figures whose change is a difference; that of others is a ratio."""
 
 
+def columns_of(data: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """The measurements of a fine-tuning by the words for its models, those that were made."""
+    learned = "control" if data["settings"]["goal"] == CONTROL else "pruned"
+    columns = {"original": data.get("before"), learned: data.get("after")}
+    return {name: each for name, each in columns.items() if each}
+
+
 def describe(columns: Mapping[str, dict[str, Any]]) -> str:
     """A table with a column for each measurement, and the change between the last two."""
     lines = []

@@ -19,6 +19,7 @@ from fragprune_plugins.workbench.figures.wording import (
     FELL,
     ITSELF,
     begun,
+    columns_of,
     describe,
     next_steps,
     outcome,
@@ -156,7 +157,7 @@ class Finetuned:
         result, settings, before = self.result, self.result.settings, data["before"]
         pressure = f" at pressure {data['pressure']:.2g}" if settings.goal.presses else ""
         lines = [
-            describe({"original": before, "pruned": data["after"]}),
+            describe(columns_of(data)),
             "",
             outcome("finetune", data, data["control"]),
             f"{result.engine} engine, {data['iterations']} iterations{pressure} in "

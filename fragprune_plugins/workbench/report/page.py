@@ -78,6 +78,8 @@ def compose(
     template: Path,
     drawn: Drawn | None,
     source: Callable[[str], str],
+    *,
+    labels: Sequence[str] = NAMES,
     **values: Any,
 ) -> str:
     """A page of a result as HTML.
@@ -86,6 +88,7 @@ def compose(
         template: ``TEMPLATE``, or one that extends it.
         drawn: the views that ``draw_views`` drew; None where there are none.
         source: turns a picture's file name into its ``src``, a relative path or a data URL.
+        labels: what people read for the two models.
         values: title; facts, (number, words) of each; quote, a sentence; notes; table; plots,
             (heading, file) of each; others, with heading, sentence and table; settings, a table.
     """
@@ -95,6 +98,7 @@ def compose(
         TEMPLATE.parent,
         source=source,
         names=NAMES,
+        labels=labels,
         views=shown.views,
         target=shown.target,
         most_fragments=shown.most_fragments,

@@ -35,6 +35,7 @@ from fragprune_plugins.workbench.figures.recorded import recorded
 from fragprune_plugins.workbench.figures.wording import (
     IS_CONTROL,
     PROFILED,
+    columns_of,
     fewer,
     gain,
     headlines,
@@ -84,6 +85,7 @@ def report(*, folder: Path, out: Path | None, data: Path | None, engine: EngineO
             title=f"{_heading(main)} of {_of(main, folder)}",
             facts=_facts(main, files),
             quote=line,
+            labels=("original", "control") if control else report_page.NAMES,
             notes=filter(None, [_ONLY_CONTROLS if control else "", portable(missing, folder)]),
             table=_table(main),
             plots=more,
@@ -136,8 +138,7 @@ def _columns(record: Record) -> dict[str, dict[str, Any]]:
         return {"A": data["a"], "B": data["b"]}
     if record.command == "profile":
         return {PROFILED[key]: each for key, each in data["columns"].items()}
-    names = {"original": "before", "pruned": "after"}
-    return {name: data[key] for name, key in names.items() if data.get(key)}
+    return columns_of(data)
 
 
 def _table(record: Record) -> Table:

@@ -22,7 +22,9 @@ from fragprune_plugins.workbench.commands.opening import bound_threads, open_eng
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
 from fragprune_plugins.workbench.figures.wording import (
+    IS_CONTROL,
     begun,
+    columns_of,
     describe,
     fewer,
     missed,
@@ -176,32 +178,28 @@ def _describe(
     if summary.already_finished:
         return (
             f"{summary.model_after} is finished: stage 2 with these settings wrote it before, and "
-            f"nothing was run. --again learns again.\n"
-            f"Compare: fragprune compare {summary.model_before} {summary.model_after}"
+            f"nothing was run. --again learns again.{_comparable(summary)}"
         )
     if not summary.steps:
         return f"{summary.adapter}: the host ended; nothing was learned (--stage {summary.stage})."
     lines = []
+    control = summary.settings["goal"] == records.CONTROL
     if data["before"]:
-        columns = {"original": data["before"], "pruned": data["after"]}
-        lines += [describe(columns), "", outcome("run", data, data["control"])]
+        lines += [describe(columns_of(data)), "", outcome("run", data, data["control"])]
         lines += begun(data, data["before"]["gaussians"] - data["after"]["gaussians"])
     else:
         if data["after"]:
-            lines += [describe({"after": data["after"]}), "", _CONTROL]
+            lines += [describe(columns_of(data)), "", *([] if control else [_CONTROL])]
         if summary.fragments_before and summary.fragments_after:
             change = fewer(summary.fragments_before, summary.fragments_after)
             lines.append(
-                f"{change} on training views; frame times were not measured.{missed(data)}"
+                f"{change} on training views; frame times were not measured"
+                f"{IS_CONTROL if control else f'.{missed(data)}'}"
             )
         if not_compared:
             why = f"{not_compared.where}: {not_compared.found}. {not_compared.remedy}"
             lines.append(f"Not compared on held-out views because of {why}")
-        elif summary.photographs:
-            models = f"{summary.model_before or 'OTHER'} {summary.model_after}"
-            lines.append(f"Compare: fragprune compare {models}")
     pressure = f" at pressure {summary.curves[-1]['pressure']:.2g}" if summary.curves else ""
-    control = summary.settings["goal"] == records.CONTROL
     learned = "of the control" if control else _WHERE.get(summary.stage, "of stage 2")
     lines.append(
         f"{summary.adapter}, {summary.engine or 'host'} engine on {summary.device}: "
@@ -214,6 +212,15 @@ def _describe(
         shown = summary.model_after if _viewable(summary.model_after) else None
         lines.append(next_steps(shown, summary.output, scene))
     return "\n".join(lines)
+
+
+def _comparable(summary: launch.RunSummary) -> str:
+    """A line on comparing a finished run's models, if their record says that they were measured."""
+    assert summary.model_after is not None
+    record = records.beside(summary.model_after)
+    if record is None or not record.data.get("before"):
+        return ""
+    return f"\nCompare: fragprune compare {summary.model_before} {summary.model_after}"
 
 
 def _viewable(model: Path) -> bool:
