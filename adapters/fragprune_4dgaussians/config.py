@@ -19,10 +19,8 @@ class PythonFile(ConfigFile):
 
     def read(self, path: Path) -> dict[str, Any]:
         """Values by argument name."""
-        try:
-            from mmcv import Config
-        except ImportError as error:
-            raise ValueError(f"{error}; the host reads the file with mmcv 1") from error
+        from mmcv import Config
+
         config = Config.fromfile(str(path))
         groups = (config[name] for name in GROUPS if name in config)
         return {key: value for group in groups for key, value in group.items()}

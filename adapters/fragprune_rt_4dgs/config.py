@@ -18,12 +18,10 @@ class YAMLFile(ConfigFile):
 
     def read(self, path: Path) -> dict[str, Any]:
         """Values by argument name, sections flattened."""
-        try:
-            from omegaconf import OmegaConf
-            from omegaconf.errors import OmegaConfBaseException
-            from yaml import YAMLError
-        except ImportError as error:
-            raise ValueError(f"{error}; the host reads the file with omegaconf") from error
+        from omegaconf import OmegaConf
+        from omegaconf.errors import OmegaConfBaseException
+        from yaml import YAMLError
+
         try:
             return _flat(OmegaConf.to_container(OmegaConf.load(path), resolve=True))
         except (OmegaConfBaseException, YAMLError) as error:

@@ -10,11 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from fragprune_plugins.errors import ModelFileError, NotComparedError, UsageError
+from fragprune_plugins.errors import HostNeedsError, ModelFileError, NotComparedError, UsageError
 from fragprune_plugins.files.reading import MEBIBYTE, Door, parse_json
 from fragprune_plugins.hosts.dialect import Dialect
 from fragprune_plugins.hosts.findings import Finding, Match
 from fragprune_plugins.hosts.photographs import Photographs
+from fragprune_plugins.hosts.preflight import Missing, install
 from fragprune_plugins.hosts.seams import Seam, SeamCall
 from fragprune_plugins.hosts.source import HostRepo, look_up
 
@@ -126,12 +127,18 @@ def read_config(config: ConfigFile, path: Path) -> dict[str, Any]:
     """The values of a configuration file by argument name.
 
     Raises:
+        HostNeedsError: the package is missing with which the host reads it.
         UsageError: the file cannot be read.
     """
     remedy, expected = f"Correct {config.flag} {path}.", "a file the host can read"
     door = Door(UsageError, "unreadable", expected, remedy, limit=MEBIBYTE, missing=remedy)
     with door.reading(path):
-        return config.read(path)
+        try:
+            return config.read(path)
+        except ImportError as error:
+            package = Missing((error.name or "").split(".")[0], str(path))
+            needed, remedy = "a package with which the host reads it", f"Run: {install([package])}"
+            raise HostNeedsError(f"{config.flag} {path}", str(error), needed, remedy) from error
 
 
 class Flags(argparse.ArgumentParser):

@@ -16,6 +16,7 @@ DISTRIBUTIONS = {
     "OpenGL": "PyOpenGL",
     "PIL": "pillow",
     "cv2": "opencv-python-headless",
+    "mmcv": "'mmcv<2'",  # its later releases lack what hosts import
     "skimage": "scikit-image",
     "sklearn": "scikit-learn",
     "tinycudann": "git+https://github.com/NVlabs/tiny-cuda-nn/#subdirectory=bindings/torch",

@@ -44,16 +44,17 @@ def telling(script: Path, root: Path) -> Iterator[None]:
             file = Path(inside[-1].filename).relative_to(root)
             where = f"{file}:{inside[-1].lineno} in {inside[-1].name}"
         message = "".join(str(error).strip().splitlines()[:1])
-        remedy = "Read the traceback above."
+        expected, remedy = f"{script.name} to run to its end", "Read the traceback above."
         lacking = (error.name or "").split(".")[0] if isinstance(error, ImportError) else ""
-        if isinstance(error, ModuleNotFoundError) and not HostRepo(root).path(lacking):
-            remedy = f"Run: {preflight.install([preflight.Missing(lacking, where)])}"
-        elif Path(frames[-1].filename).is_relative_to(_OURS):
+        if Path(frames[-1].filename).is_relative_to(_OURS):
             remedy = "fragprune raised it. Report it with the traceback above."
+        elif isinstance(error, ModuleNotFoundError) and not HostRepo(root).path(lacking):
+            expected = "what the host itself imports"
+            remedy = f"Run: {preflight.install([preflight.Missing(lacking, where)])}"
         raise HostFailed(
             where,
             f"{type(error).__name__}{f': {message}' if message else ''}",
-            f"{script.name} to run to its end",
+            expected,
             remedy,
         ) from error
 

@@ -1,6 +1,7 @@
 """RT-4DGS: its call, its rows, its YAML and its checkpoints, on a miniature of the host."""
 
 import itertools
+import sys
 from importlib import import_module
 
 import pytest
@@ -10,7 +11,7 @@ from miniatures.runs import miniature
 from scenes import blended
 
 from fragprune_plugins.engines.reference import ReferenceEngine
-from fragprune_plugins.errors import AlignmentError, UsageError
+from fragprune_plugins.errors import AlignmentError, HostNeedsError, UsageError
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
@@ -314,6 +315,12 @@ def test_a_file_that_cannot_be_read_is_refused(mini, tmp_path, text):
         file.write_text(text)
     with pytest.raises(UsageError, match="--config"):
         run(command(mini, file), RunOptions(**OPTIONS))
+
+
+def test_without_omegaconf_the_error_says_who_needs_it(mini, config, monkeypatch):
+    monkeypatch.setitem(sys.modules, "omegaconf", None)
+    with pytest.raises(HostNeedsError, match=r"omegaconf.*host reads.*pip install omegaconf"):
+        run(command(mini, config()), RunOptions(**OPTIONS))
 
 
 def test_a_layout_that_nothing_can_be_added_to_is_refused(mini, tmp_path, photographs):

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+import torch
 from miniatures.skeletons import FLAGS, skeleton
 
 from fragprune_plugins.engines.cuda import driver
@@ -218,8 +219,19 @@ def test_a_hosts_exception_is_told_in_a_line_and_nothing_stays_patched(host, cap
 
 
 def test_a_package_that_is_missed_only_while_the_host_runs_is_named_with_the_way_to_get_it(host):
-    with pytest.raises(HostFailed, match="Run: pip install opencv_of_tests"):
+    said = "what the host itself imports. Run: pip install opencv_of_tests"
+    with pytest.raises(HostFailed, match=said):
         run([host("def late():\n    import opencv_of_tests.core\nlate()")], CPU)
+
+
+def test_a_package_that_our_own_code_misses_is_not_said_to_be_the_hosts(host, monkeypatch):
+    def lacks(*_):
+        import ours_of_tests  # noqa: F401
+
+    monkeypatch.setattr(process, "_OURS", Path(__file__).parent)
+    monkeypatch.setattr(torch, "median", lacks)
+    with pytest.raises(HostFailed, match=r"No module named.*fragprune raised it"):
+        run([host("import torch\ntorch.median(0)")], CPU)
 
 
 def test_what_a_host_imports_and_reads_is_looked_at_before_it_runs(host, tmp_path):
