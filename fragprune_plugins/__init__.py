@@ -17,29 +17,45 @@ from typing import TYPE_CHECKING, Any
 from fragprune_plugins.constants import VERSION
 
 if TYPE_CHECKING:
-    from fragprune_plugins.files.model import Model
-    from fragprune_plugins.injection.api import activate, deactivate, paused
-    from fragprune_plugins.learning.goals import Control, Fewer, Portable, Pressure
-    from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
-    from fragprune_plugins.learning.thresholds import ThresholdStore
-    from fragprune_plugins.plugins.hooks import engine_for
-    from fragprune_plugins.types import Footprints, RasterInputs, RasterOutputs, Splats, View
-    from fragprune_plugins.workbench.distributed.processes import part_of, whole_of
-    from fragprune_plugins.workbench.distributed.sharded import ShardedEngine
-    from fragprune_plugins.workbench.figures.drawing import rasterize
-    from fragprune_plugins.workbench.figures.evaluate import measure
-    from fragprune_plugins.workbench.figures.viewing import overview, render_view
-    from fragprune_plugins.workbench.finetune.api import finetune
-    from fragprune_plugins.workbench.finetune.result import FinetuneResult
-    from fragprune_plugins.workbench.goals import AtMost, Faster
-    from fragprune_plugins.workbench.models.model import load, save
-    from fragprune_plugins.workbench.pruning.scores import keep_best, keep_needed
-    from fragprune_plugins.workbench.ranks import joined
-    from fragprune_plugins.workbench.scenes.cameras import load_cameras
-    from fragprune_plugins.workbench.scenes.dataset import load_dataset
-    from fragprune_plugins.workbench.scenes.generated import views_near
-    from fragprune_plugins.workbench.scenes.itself import own_pictures
-    from fragprune_plugins.workbench.scenes.pinhole import look_at
+    from fragprune_plugins.files.model import Model as Model
+    from fragprune_plugins.injection.api import activate as activate
+    from fragprune_plugins.injection.api import deactivate as deactivate
+    from fragprune_plugins.injection.api import paused as paused
+    from fragprune_plugins.learning.goals import Control as Control
+    from fragprune_plugins.learning.goals import Fewer as Fewer
+    from fragprune_plugins.learning.goals import Portable as Portable
+    from fragprune_plugins.learning.goals import Pressure as Pressure
+    from fragprune_plugins.learning.schedule import Schedule as Schedule
+    from fragprune_plugins.learning.schedule import Settings as Settings
+    from fragprune_plugins.learning.schedule import StepPlan as StepPlan
+    from fragprune_plugins.learning.thresholds import ThresholdStore as ThresholdStore
+    from fragprune_plugins.plugins.hooks import engine_for as engine_for
+    from fragprune_plugins.types import Footprints as Footprints
+    from fragprune_plugins.types import RasterInputs as RasterInputs
+    from fragprune_plugins.types import RasterOutputs as RasterOutputs
+    from fragprune_plugins.types import Splats as Splats
+    from fragprune_plugins.types import View as View
+    from fragprune_plugins.workbench.distributed.processes import part_of as part_of
+    from fragprune_plugins.workbench.distributed.processes import whole_of as whole_of
+    from fragprune_plugins.workbench.distributed.sharded import ShardedEngine as ShardedEngine
+    from fragprune_plugins.workbench.figures.drawing import rasterize as rasterize
+    from fragprune_plugins.workbench.figures.evaluate import measure as measure
+    from fragprune_plugins.workbench.figures.viewing import overview as overview
+    from fragprune_plugins.workbench.figures.viewing import render_view as render_view
+    from fragprune_plugins.workbench.finetune.api import finetune as finetune
+    from fragprune_plugins.workbench.finetune.result import FinetuneResult as FinetuneResult
+    from fragprune_plugins.workbench.goals import AtMost as AtMost
+    from fragprune_plugins.workbench.goals import Faster as Faster
+    from fragprune_plugins.workbench.models.model import load as load
+    from fragprune_plugins.workbench.models.model import save as save
+    from fragprune_plugins.workbench.pruning.scores import keep_best as keep_best
+    from fragprune_plugins.workbench.pruning.scores import keep_needed as keep_needed
+    from fragprune_plugins.workbench.ranks import joined as joined
+    from fragprune_plugins.workbench.scenes.cameras import load_cameras as load_cameras
+    from fragprune_plugins.workbench.scenes.dataset import load_dataset as load_dataset
+    from fragprune_plugins.workbench.scenes.generated import views_near as views_near
+    from fragprune_plugins.workbench.scenes.itself import own_pictures as own_pictures
+    from fragprune_plugins.workbench.scenes.pinhole import look_at as look_at
 
 __version__ = VERSION
 
@@ -72,48 +88,7 @@ _NAMES = {
 
 _HOME = {name: module for module, names in _NAMES.items() for name in names.split()}
 
-__all__ = [
-    "AtMost",
-    "Control",
-    "Faster",
-    "Fewer",
-    "FinetuneResult",
-    "Footprints",
-    "Model",
-    "Portable",
-    "Pressure",
-    "RasterInputs",
-    "RasterOutputs",
-    "Schedule",
-    "Settings",
-    "ShardedEngine",
-    "Splats",
-    "StepPlan",
-    "ThresholdStore",
-    "View",
-    "__version__",
-    "activate",
-    "deactivate",
-    "engine_for",
-    "finetune",
-    "joined",
-    "keep_best",
-    "keep_needed",
-    "load",
-    "load_cameras",
-    "load_dataset",
-    "look_at",
-    "measure",
-    "overview",
-    "own_pictures",
-    "part_of",
-    "paused",
-    "rasterize",
-    "render_view",
-    "save",
-    "views_near",
-    "whole_of",
-]
+__all__ = sorted(["__version__", *_HOME])
 
 
 def __getattr__(name: str) -> Any:
@@ -123,4 +98,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return __all__
