@@ -14,13 +14,8 @@ class Spacetime(binding.Sized):
     _fields_ = (
         ("size", ctypes.c_uint32),
         ("threads", ctypes.c_int32),
-        ("timestamp", ctypes.c_float),
-        ("duration", ctypes.c_float),
-        ("prefilter_var", ctypes.c_float),
-        ("scale_modifier", ctypes.c_float),
-        ("sh_degree", ctypes.c_int32),
-        ("sh_degree_t", ctypes.c_int32),
-        ("sh_coefficients", ctypes.c_int32),
+        *binding.several(ctypes.c_float, "timestamp duration prefilter_var scale_modifier"),
+        *binding.several(ctypes.c_int32, "sh_degree sh_degree_t sh_coefficients"),
         ("count", ctypes.c_int64),
         ("lengths", binding.Lengths),
         *binding.pointers(

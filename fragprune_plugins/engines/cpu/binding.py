@@ -55,22 +55,23 @@ class Sized(_Named):
         super().__init__(size=ctypes.sizeof(type(self)), **fields)
 
 
+def several(kind: Any, names: str) -> tuple[tuple[str, Any], ...]:
+    """Fields of a struct that are of one kind, by their names in one string."""
+    return tuple((name, kind) for name in names.split())
+
+
 def pointers(names: str) -> tuple[tuple[str, Any], ...]:
-    """Fields of a struct that are addresses, by their names in one string."""
-    return tuple((name, _POINTER) for name in names.split())
-
-
-def _integers(names: str) -> tuple[tuple[str, Any], ...]:
-    return tuple((name, ctypes.c_int64) for name in names.split())
+    """Fields of a struct that are addresses, likewise."""
+    return several(_POINTER, names)
 
 
 class Lengths(_Named):
     """fragprune_lengths."""
 
     _fields_ = (
-        *_integers("viewmatrix projmatrix campos background means opacities scales rotations"),
-        *_integers("cov3d sh colors features thresholds sample_offsets"),
-        *_integers("means2d conics depths tiles times scales_t rotations_r sh_rest"),
+        *several(ctypes.c_int64, "viewmatrix projmatrix campos background means opacities scales"),
+        *several(ctypes.c_int64, "rotations cov3d sh colors features thresholds sample_offsets"),
+        *several(ctypes.c_int64, "means2d conics depths tiles times scales_t rotations_r sh_rest"),
     )
 
 
@@ -83,25 +84,10 @@ class Inputs(Sized):
 
     _fields_ = (
         ("size", ctypes.c_uint32),
-        ("threads", ctypes.c_int32),
-        ("width", ctypes.c_int32),
-        ("height", ctypes.c_int32),
-        ("tan_fov_x", ctypes.c_float),
-        ("tan_fov_y", ctypes.c_float),
-        ("scale_modifier", ctypes.c_float),
-        ("dilation", ctypes.c_float),
-        ("near", ctypes.c_float),
-        ("alpha_max", ctypes.c_float),
-        ("stop", ctypes.c_float),
-        ("compensation", ctypes.c_int32),
-        ("cap_gradient", ctypes.c_int32),
-        ("absolute_gradient", ctypes.c_int32),
-        ("sh_degree", ctypes.c_int32),
-        ("sh_coefficients", ctypes.c_int32),
-        ("feature_count", ctypes.c_int32),
-        ("widen", ctypes.c_int32),
-        ("flat", ctypes.c_int32),
-        ("soft", ctypes.c_int32),
+        *several(ctypes.c_int32, "threads width height"),
+        *several(ctypes.c_float, "tan_fov_x tan_fov_y scale_modifier dilation near alpha_max stop"),
+        *several(ctypes.c_int32, "compensation cap_gradient absolute_gradient sh_degree"),
+        *several(ctypes.c_int32, "sh_coefficients feature_count widen flat soft"),
         ("count", ctypes.c_int64),
         ("lengths", Lengths),
         *pointers("viewmatrix projmatrix campos background means opacities scales rotations"),
@@ -117,12 +103,8 @@ class Outputs(Sized):
         ("size", ctypes.c_uint32),
         *pointers("image invdepth alpha radii features fragments fragments_per_gaussian"),
         *pointers("weights_per_gaussian wins_per_gaussian winners surface"),
-        ("drawn", ctypes.c_int64),
-        ("evaluated", ctypes.c_int64),
-        ("entries", ctypes.c_int64),
-        ("projection_ms", ctypes.c_float),
-        ("binning_ms", ctypes.c_float),
-        ("blend_ms", ctypes.c_float),
+        *several(ctypes.c_int64, "drawn evaluated entries"),
+        *several(ctypes.c_float, "projection_ms binning_ms blend_ms"),
     )
 
 
@@ -151,15 +133,10 @@ class Photometric(Sized):
 
     _fields_ = (
         ("size", ctypes.c_uint32),
-        ("threads", ctypes.c_int32),
-        ("channels", ctypes.c_int32),
-        ("height", ctypes.c_int32),
-        ("width", ctypes.c_int32),
-        ("l1_weight", ctypes.c_float),
-        ("ssim_weight", ctypes.c_float),
+        *several(ctypes.c_int32, "threads channels height width"),
+        *several(ctypes.c_float, "l1_weight ssim_weight"),
         *pointers("image target gradient workspace"),
-        ("l1", ctypes.c_double),
-        ("dissimilarity", ctypes.c_double),
+        *several(ctypes.c_double, "l1 dissimilarity"),
     )
 
 
