@@ -13,7 +13,6 @@ from torch.autograd.function import once_differentiable
 from fragprune_plugins.engines.calling import address, empty, expect_ok, native_threads, plain
 from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.errors import InputError
-from fragprune_plugins.learning.losses import SSIM_WEIGHT
 from fragprune_plugins.types import short
 
 _workspace = cache(binding.Workspace)
@@ -23,20 +22,18 @@ def compiled_loss(
     image: Tensor,
     target: Tensor,
     *,
-    l1_weight: float = 1 - SSIM_WEIGHT,
-    ssim_weight: float = SSIM_WEIGHT,
+    ssim_weight: float,
     library: binding.Library | None = None,
 ) -> Tensor:
-    """l1_weight L1 + ssim_weight (1 - SSIM) of two images, by the compiled code.
+    """(1 - ssim_weight) L1 + ssim_weight (1 - SSIM) of two images, by the compiled code.
 
     The same to the bit for any number of threads.
 
     Args:
         image: (C, H, W) float32 on a CPU, in any memory layout; differentiable, once.
         target: likewise, but a constant.
-        l1_weight: factor on the mean absolute difference.
         ssim_weight: factor on 1 - SSIM, the mean over all pixels and channels as in
-            ``learning.losses.ssim_map``.
+            ``learning.losses.ssim_map``; the mean absolute difference has the rest.
         library: the build to use; None for the best one on this machine.
 
     Raises:
@@ -54,7 +51,7 @@ def compiled_loss(
     if target.requires_grad:
         raise InputError("target", "requires_grad", "a constant", "Detach it.")
     given = binding.library() if library is None else library
-    loss: Tensor = _Compiled.apply(image, target, l1_weight, ssim_weight, given)  # type: ignore[no-untyped-call]
+    loss: Tensor = _Compiled.apply(image, target, ssim_weight, given)  # type: ignore[no-untyped-call]
     return loss
 
 
@@ -63,12 +60,7 @@ class _Compiled(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any,
-        image: Tensor,
-        target: Tensor,
-        l1_weight: float,
-        ssim_weight: float,
-        library: binding.Library,
+        ctx: Any, image: Tensor, target: Tensor, ssim_weight: float, library: binding.Library
     ) -> Tensor:
         x, y = plain(image), plain(target)
         channels, height, width = x.shape
@@ -79,7 +71,7 @@ class _Compiled(torch.autograd.Function):
             channels=channels,
             height=height,
             width=width,
-            l1_weight=l1_weight,
+            l1_weight=1 - ssim_weight,
             ssim_weight=ssim_weight,
             image=address(x),
             target=address(y),
@@ -91,11 +83,11 @@ class _Compiled(torch.autograd.Function):
         expect_ok(call(ctypes.byref(images), ctypes.byref(error)), error)
         if gradient is not None:
             ctx.save_for_backward(gradient)
-        return x.new_tensor(l1_weight * images.l1 + ssim_weight * images.dissimilarity)
+        return x.new_tensor((1 - ssim_weight) * images.l1 + ssim_weight * images.dissimilarity)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
         (gradient,) = ctx.saved_tensors
         scaled = gradient if upstream == 1 else gradient * upstream
-        return scaled, None, None, None, None
+        return scaled, None, None, None

@@ -67,7 +67,7 @@ def images(call: SeamCall) -> tuple[Tensor, Tensor] | None:
 def similarity(image: Tensor, target: Tensor) -> Tensor:
     """Mean structural similarity, by compiled code."""
     image, target = (each.reshape(each.shape[-3:]) for each in (image, target))
-    return 1 - compiled_loss(image, target, l1_weight=0.0, ssim_weight=1.0)
+    return 1 - compiled_loss(image, target, ssim_weight=1.0)
 
 
 @torch.enable_grad()

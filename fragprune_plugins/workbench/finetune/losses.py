@@ -34,7 +34,7 @@ def photometric_loss(image: Tensor, target: Tensor) -> Tensor:
     usual = image.dtype == target.dtype == torch.float32 and not target.requires_grad
     code = code_for(image.device) if usual and image.device == target.device else "torch"
     if code == "cpu":
-        return compiled_loss(image, target)
+        return compiled_loss(image, target, ssim_weight=SSIM_WEIGHT)
     if code == "fused-ssim":
         from fused_ssim import fused_ssim
 
