@@ -33,9 +33,7 @@ class CudaEngine:
     name = "cuda"
 
     def __init__(self, device: Device | None = None, *, deterministic: bool | None = None) -> None:
-        if device is None:
-            device = Driver()
-        self.device = device
+        self.device = Driver() if device is None else device
         self._deterministic = deterministic
         self._capacity = _FIRST_CAPACITY
 
@@ -89,9 +87,8 @@ class CudaEngine:
         deterministic = self._deterministic
         if deterministic is None:
             deterministic = torch.are_deterministic_algorithms_enabled()
-        drawn = drawing.draw(self._capacity, wanted, deterministic=deterministic)
-        if (entries := drawing.read()) > self._capacity:
-            self._capacity = entries + entries // 4
+        while True:
             drawn = drawing.draw(self._capacity, wanted, deterministic=deterministic)
-            drawing.read()
-        return drawn
+            if (entries := drawing.read()) <= self._capacity:
+                return drawn
+            self._capacity = entries + entries // 4

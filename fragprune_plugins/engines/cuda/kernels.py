@@ -8,17 +8,15 @@ from __future__ import annotations
 
 import hashlib
 import os
-import tempfile
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
-from filelock import FileLock, Timeout
-
 from fragprune_plugins import native
+from fragprune_plugins.errors import OutputError
+from fragprune_plugins.files.atomic import locked, replacing
 
 ENVIRONMENT: Final = "FRAGPRUNE_CUDA"
 """Set to off, it switches the cuda engine off."""
@@ -31,7 +29,7 @@ SOURCES: Final = Path(native.__file__).parent / "cuda"
 OLDEST: Final = 75
 """Compute capability, major times ten plus minor: warps' matching and independent lanes."""
 
-_OPTIONS: Final = ("-std=c++17", "-fmad=false")
+_OPTIONS: Final = ("--std=c++17", "--fmad=false")
 """Nothing is contracted but what is spelled out: see native/cuda/numbers.cuh."""
 
 _STDINT: Final = b"""
@@ -95,7 +93,7 @@ class Nvrtc:
             "nvrtcCreateProgram", text, f"{source}.cu".encode(), 1, [_STDINT], [b"stdint.h"]
         )[0]
         options = [
-            *(option.replace("-std", "--std").replace("-fmad", "--fmad") for option in _OPTIONS),
+            *_OPTIONS,
             *(f"-D{name}={value}" for name, value in macros.items()),
             f"--gpu-architecture={target}",
             f"--include-path={SOURCES}",
@@ -103,20 +101,22 @@ class Nvrtc:
             "--ptxas-options=-v",
         ]
         try:
-            failure = None
             try:
                 encoded = [option.encode() for option in options]
                 self._call("nvrtcCompileProgram", program, len(encoded), encoded)
-            except Unavailable as error:
-                failure = error
-            log = self._text(program, "nvrtcGetProgramLogSize", "nvrtcGetProgramLog")
-            if failure is not None:
-                raise Unavailable(f"{source}.cu for {target}: {failure}\n{log.decode()}")
+            except Unavailable as failure:
+                said = f"{source}.cu for {target}: {failure}\n{self._log(program)}"
+                raise Unavailable(said) from None
+            log = self._log(program)
             what = "CUBIN" if target.startswith("sm_") else "PTX"
             code = self._text(program, f"nvrtcGet{what}Size", f"nvrtcGet{what}")
         finally:
             self._call("nvrtcDestroyProgram", program)
-        return Image(code, log.decode(errors="replace").rstrip("\0 \n"))
+        return Image(code, log)
+
+    def _log(self, program: Any) -> str:
+        text = self._text(program, "nvrtcGetProgramLogSize", "nvrtcGetProgramLog")
+        return text.decode(errors="replace").rstrip("\0 \n")
 
     def _text(self, program: Any, size: str, get: str) -> bytes:
         buffer = bytes(self._call(size, program)[0])
@@ -221,33 +221,17 @@ def image_of(
         Unavailable: there is no compiler, or the source does not compile.
     """
     by = compiler() if by is None else by
-    folder = cache_folder()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return by.compile(source, macros, target), False
-    path = folder / f"{_name_of(by, source, macros, target)}.bin"
-    with _one_at_a_time(path):
-        kept = _read(path)
-        if kept is not None:
+    path = cache_folder() / f"{_name_of(by, source, macros, target)}.bin"
+    with ExitStack() as alone:
+        with suppress(OSError, OutputError):  # read-only; held by a process that hangs
+            path.parent.mkdir(parents=True, exist_ok=True)
+            alone.enter_context(locked(path, wait=300, what="compiling"))
+        if (kept := _read(path)) is not None:
             return kept, True
         image = by.compile(source, macros, target)
-        with suppress(OSError):  # read-only, or full
-            _write(path, image)
+        with suppress(OutputError), replacing(path) as new:  # read-only, or full
+            _write(new, image)
         return image, False
-
-
-@contextmanager
-def _one_at_a_time(path: Path) -> Iterator[None]:
-    """Wait for other processes that write the file, if files can be locked.
-
-    Without locks two processes may write the same file in turn. Neither reads a partial file.
-    """
-    with ExitStack() as held:
-        # read-only; held by a process that hangs; file systems without locks
-        with suppress(OSError, Timeout, NotImplementedError):
-            held.enter_context(FileLock(f"{path}.lock", timeout=300))
-        yield
 
 
 def _read(path: Path) -> Image | None:
@@ -263,9 +247,6 @@ def _read(path: Path) -> Image | None:
 
 
 def _write(path: Path, image: Image) -> None:
-    """Write an image to the cache; readers see all of it or nothing."""
     log = image.log.encode()
     rest = log + image.code
-    with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-        file.write(f"{hashlib.sha256(rest).hexdigest()}\n{len(log)}\n".encode() + rest)
-    os.replace(file.name, path)
+    path.write_bytes(f"{hashlib.sha256(rest).hexdigest()}\n{len(log)}\n".encode() + rest)
