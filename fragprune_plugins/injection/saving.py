@@ -65,16 +65,12 @@ def on_pack(session: SessionState, call: SeamCall) -> Any:
     state = session.models.get(model) if model is not None else None
     if packed is None:
         return result
-    path, which = packed
-    if state is None or not state.store.cuts:  # loading would refuse an earlier file's as stale
-        sidecar.path_beside(path).unlink(missing_ok=True)
-        return result
-    rows = which
-    if which.ndim > 1:
-        rows = rows_of(which, session.adapter.means(model), str(call.seam))
-    store = ThresholdStore(0)
-    store.load_state_dict(state.store.state_dict())
-    store.rearrange(rows, torch.zeros(len(rows), dtype=torch.bool))
+    (path, rows), store = packed, None
+    if state is not None and state.store.cuts:
+        if rows.ndim > 1:
+            rows = rows_of(rows, session.adapter.means(model), str(call.seam))
+        store = state.store.clone("cpu")
+        store.rearrange(rows, torch.zeros(len(rows), dtype=torch.bool))
     session.write_sidecar(path, store)
     return result
 

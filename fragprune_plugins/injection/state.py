@@ -220,35 +220,37 @@ class SessionState:
                 "save()", "a model without thresholds", "a trained model", "Train the model first."
             )
         self.expect_rows(model, state, str(path))
-        if not state.store.cuts and not self.standing_still(model):
-            # Loading would refuse the sidecar of an earlier model with this name as stale.
-            if whole is None:
-                sidecar.path_beside(path).unlink(missing_ok=True)
-            else:
-                sidecar.replace_pair(path, whole, None)
-        else:
-            if state.stage is not None and state.stage.warming_up:
-                log.warning(
-                    "%s: saved in step %d of %d, before thresholds open: nothing is truncated yet. "
-                    "If training ends here, give its length as Settings.iterations.",
-                    path,
-                    state.stage.steps,
-                    self.settings.iterations,
-                )
-            self.write_sidecar(path, state.store, whole)
+        learned = state.store.cuts or self.standing_still(model)
+        if learned and state.stage is not None and state.stage.warming_up:
+            log.warning(
+                "%s: saved in step %d of %d, before thresholds open: nothing is truncated yet. "
+                "If training ends here, give its length as Settings.iterations.",
+                path,
+                state.stage.steps,
+                self.settings.iterations,
+            )
+        self.write_sidecar(path, state.store if learned else None, whole)
 
-    def write_sidecar(self, path: Path, store: ThresholdStore, whole: Path | None = None) -> None:
-        """Write a store's sidecar beside a file and tell observers; see ``save``."""
+    def write_sidecar(
+        self, path: Path, store: ThresholdStore | None, whole: Path | None = None
+    ) -> None:
+        """Write a store's sidecar beside a file and tell observers; see ``save``.
+
+        None removes that of an earlier file of this name, which loading would refuse as stale.
+        """
         about: dict[str, Any] = {
             "adapter": self.adapter.name,
             "host_commit": self.repo.commit,
             "settings": self.settings.as_dict(),
         }
-        if whole is None:
+        if whole is not None:
+            sidecar.replace_pair(path, whole, store, **about)
+        elif store is not None:
             sidecar.save(path, store, **about)
         else:
-            sidecar.replace_pair(path, whole, store, **about)
-        self.plugins.tell(hookspecs.fragprune_saved, path=sidecar.path_beside(path))
+            sidecar.path_beside(path).unlink(missing_ok=True)
+        if store is not None:
+            self.plugins.tell(hookspecs.fragprune_saved, path=sidecar.path_beside(path))
 
     def load(self, model: Any, path: Path) -> bool:
         """Load a model's thresholds with ``path``, the file that the host just read, if it has any.
