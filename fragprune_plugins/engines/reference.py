@@ -6,20 +6,8 @@ from dataclasses import fields
 from typing import TYPE_CHECKING
 
 from fragprune_plugins.engines.calling import with_joined_sh
-from fragprune_plugins.types import (
-    Footprints,
-    RasterInputs,
-    RasterOutputs,
-    Splats,
-)
-from reference_renderer import (
-    Camera,
-    Gaussians,
-    Options,
-    Rendering,
-    render,
-    render_footprints,
-)
+from fragprune_plugins.types import Footprints, RasterInputs, RasterOutputs, Splats
+from reference_renderer import Camera, Gaussians, Options, Rendering, render, render_footprints
 from reference_renderer import Footprints as Projected
 
 if TYPE_CHECKING:

@@ -85,7 +85,6 @@ def read_ply(path: Path, *, filtered: bool = False) -> Model:
         )
     with _DOOR.reading(path) as reading:
         rules = _rules_in(reading)
-        reading.file.seek(0)
         try:
             columns = read_vertices(reading)
         except KeyError as error:
@@ -96,12 +95,13 @@ def read_ply(path: Path, *, filtered: bool = False) -> Model:
 
 
 def _rules_in(reading: Reading) -> dict[str, Any]:
-    """The stop and the rim that a PLY's header names, by these names."""
+    """The stop and the rim that a PLY's header names, by these names. The file is rewound."""
     rules: dict[str, Any] = {}
     for line in header_lines(reading.file.read(HEADER_MAX))[0]:
         for name, words in (("stop", STOP), ("rim", RIM)):
             if line.startswith(begin := f"comment {words} ".encode()) and name not in rules:
                 rules[name] = line.removeprefix(begin).strip().decode()
+    reading.file.seek(0)
     return rules | ({"stop": float(rules["stop"])} if "stop" in rules else {})
 
 
@@ -216,9 +216,7 @@ def read_thresholds(path: Path) -> ThresholdStore | None:
     if not any(each.endswith(column) or each.startswith(comment) for each in lines):
         return None
     with _DOOR.reading(path) as reading:
-        rules = _rules_in(reading)
-        reading.file.seek(0)
-        columns = read_vertices(reading)
+        rules, columns = _rules_in(reading), read_vertices(reading)
         if (values := columns.get(THRESHOLD_COLUMN)) is None:
             store = ThresholdStore(len(next(iter(columns.values()))))
         else:

@@ -21,6 +21,8 @@ from fragprune_plugins.errors import LateImportError, SeamError
 from fragprune_plugins.hosts.findings import Finding
 from fragprune_plugins.hosts.seams import Seam
 
+_CHECK = "Run fragprune check on the host to see which adapter fits."
+
 Wrapper = Callable[[Callable[..., Any], Any, tuple[Any, ...], dict[str, Any]], Any]
 
 
@@ -123,20 +125,11 @@ class PatchLedger:
         try:
             original = wrapt.resolve_path(module, seam.attribute)[2]
         except AttributeError as error:
-            raise SeamError(
-                str(seam),
-                "no such function",
-                "a function to wrap",
-                "Run fragprune check on the host to see which adapter fits.",
-            ) from error
+            raise SeamError(str(seam), "no such function", "a function to wrap", _CHECK) from error
         have = tuple(inspect.signature(original).parameters)
         if missing := [name for name in seam.needs if name not in have]:
-            raise SeamError(
-                str(seam),
-                f"parameters ({', '.join(have)})",
-                f"also {', '.join(missing)}",
-                "Run fragprune check on the host to see which adapter fits.",
-            )
+            found, expected = f"parameters ({', '.join(have)})", f"also {', '.join(missing)}"
+            raise SeamError(str(seam), found, expected, _CHECK)
 
     def _refuse_late(self, module: ModuleType, seam: Seam) -> None:
         """Refuse if a module holds a copy by ``from module import name``, which stays unpatched.

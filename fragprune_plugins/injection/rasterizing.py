@@ -17,7 +17,7 @@ from fragprune_plugins.constants import NEUTRAL_LOGIT
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import AlignmentError, SessionError, UsageError
 from fragprune_plugins.hosts.dialect import HostCall
-from fragprune_plugins.hosts.seams import Seam, SeamCall
+from fragprune_plugins.hosts.seams import SeamCall
 from fragprune_plugins.injection.proofs import proved
 from fragprune_plugins.injection.saving import adopt
 from fragprune_plugins.injection.state import ModelState, SessionState
@@ -54,8 +54,11 @@ def on_view(session: SessionState, call: SeamCall) -> Any:
     model = call.arguments[call.seam.needs[1]] if own else session.model_of(call)
     if model is None:
         expect_adopted(session, call)
-        if session.learn and torch.is_grad_enabled():
-            warn_unknown(session, call.seam)
+        if session.learn and torch.is_grad_enabled() and not session.warned:
+            session.warned = True
+            log.warning(
+                "%s draws Gaussians that no seam attached; they have no thresholds", call.seam
+            )
         return call.run()
     if session.unpacked is not None:
         adopt(session, model, *session.unpacked)
@@ -115,13 +118,6 @@ def expect_adopted(session: SessionState, call: SeamCall) -> None:
 def learns(state: ModelState) -> bool:
     """Whether the model is in stage 2."""
     return state.stage is not None and state.stage.plan is not None
-
-
-def warn_unknown(session: SessionState, seam: Seam) -> None:
-    """Warn once that a view of an unknown model is drawn without thresholds."""
-    if not session.warned:
-        session.warned = True
-        log.warning("%s draws Gaussians that no seam attached; they have no thresholds", seam)
 
 
 def draw_view(

@@ -48,17 +48,15 @@ def on_attach(session: SessionState, call: SeamCall) -> Any:
     session.optimizers[model] = [weakref.ref(optimizer) for optimizer in call.how()]
     groups = session.groups(model)
     session.rates[model] = {name: group["lr"] for name, group in groups if name}
-    rows = len(session.adapter.means(model))
+    means = session.adapter.means(model)
     if state is not None and not kept:
         before = len(state.store)
-        state.store.replace(rows)
+        state.store.replace(len(means))
         session.changed(state.store, "training_setup", before)
     if not session.learn:
         return result
     if state is None:
-        store = ThresholdStore(
-            rows, session.adapter.means(model).device, session.settings.threshold_lr
-        )
+        store = ThresholdStore(len(means), means.device, session.settings.threshold_lr)
         state = session.models[model] = ModelState(store)
     if state.stage is None:
         state.stage = stage2(session, model, state)

@@ -42,7 +42,13 @@ def engine_for(
         hook = hookspecs.fragprune_create_engine
         engine = plugins.ask(hook, _no_engine, name=name, device=device)
         if engine is None:
-            raise _unknown_engine(name, plugins.answering(hook))
+            raise EngineError(
+                "engine",
+                repr(name),
+                f"one of auto, {', '.join(ENGINES)}, or the name of a plugin's engine "
+                f"(plugins asked: {', '.join(plugins.answering(hook))})",
+                "Choose one; fragprune doctor lists plugins that failed to load.",
+            )
         plugins.engines[name, device] = engine
     return engine
 
@@ -100,16 +106,6 @@ def select_adapter(
     hook = hookspecs.fragprune_select_adapter
     name: str | None = (plugins or installed()).ask(hook, wrong, repo=repo, matches=matches)
     return name
-
-
-def _unknown_engine(name: str, asked: Sequence[str]) -> EngineError:
-    return EngineError(
-        "engine",
-        repr(name),
-        f"one of auto, {', '.join(ENGINES)}, or the name of a plugin's engine "
-        f"(plugins asked: {', '.join(asked)})",
-        "Choose one; fragprune doctor lists plugins that failed to load.",
-    )
 
 
 def _no_engine(answer: Any) -> Wrong | None:

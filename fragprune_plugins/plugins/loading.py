@@ -121,9 +121,22 @@ class Plugins:
             self._manager.unregister(name=name)
             expected = "an adapter's class, or plain functions for hooks, with their arguments"
             raise _broken(name, "", str(error), expected) from error
-        if isinstance(plugin, HostAdapter):
-            _take(self, plugin)
-            self.adapters.sort(key=lambda each: each.name)
+        if not isinstance(plugin, HostAdapter):
+            return
+        if any(other.name == plugin.name for other in self.adapters):
+            self.findings.append(
+                Finding(
+                    "warning",
+                    "adapter-shadowed",
+                    f"adapter {plugin.name}",
+                    "offered twice; the first one is used",
+                    "one adapter per name",
+                    "Block one of the plugins.",
+                )
+            )
+            return
+        self.adapters.append(plugin)
+        self.adapters.sort(key=lambda each: each.name)
 
     def remove(self, name: str) -> None:
         """Take back a plugin that was registered under a name."""
@@ -227,22 +240,6 @@ def _load(plugins: Plugins, entry: EntryPoint, where: str) -> None:
         )
     else:
         plugins.loaded[entry.name] = entry.value
-
-
-def _take(plugins: Plugins, adapter: HostAdapter) -> None:
-    if any(other.name == adapter.name for other in plugins.adapters):
-        plugins.findings.append(
-            Finding(
-                "warning",
-                "adapter-shadowed",
-                f"adapter {adapter.name}",
-                "offered twice; the first one is used",
-                "one adapter per name",
-                "Block one of the plugins.",
-            )
-        )
-    else:
-        plugins.adapters.append(adapter)
 
 
 def _call(implementation: pluggy.HookImpl, hook: Hook, given: dict[str, Any]) -> Any:
