@@ -6,7 +6,7 @@ Adam. Row operations mirror what hosts do to theirs, moments included.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -19,6 +19,11 @@ from fragprune_plugins.types import Rim, is_rim, is_stop, short
 _START_MARGIN = 1e-4  # thresholds start this far (relative) below the 1/255 skip: nothing changes
 _START_MAX = 0.99
 _ROUNDING = 1e-4  # relative: sigmoid of logit loses less, unless the logit had to be clamped
+
+Known = TypeVar("Known")
+
+_Noted = tuple[Tensor, int, Known]
+"""Logits, their version, and what is known of them until they change."""
 
 
 class ThresholdStore:
@@ -47,9 +52,9 @@ class ThresholdStore:
     def _bind(self, logits: Tensor, lr: float) -> None:
         self.logits = logits.detach().clone().requires_grad_(True)
         self.optimizer = make_adam([{"params": [self.logits], "lr": lr}])
-        self._seen: tuple[Tensor, int] | None = None  # the logits last looked at, and their version
-        # the logits that given thresholds became, their version, and the thresholds
-        self._given: tuple[Tensor, int, Tensor] | None = None
+        # known of the logits: whether all are neutral, and whether none is; thresholds as given
+        self._seen: _Noted[tuple[bool, bool]] | None = None
+        self._given: _Noted[Tensor] | None = None
 
     def __len__(self) -> int:
         return len(self.logits)
@@ -112,16 +117,19 @@ class ThresholdStore:
         Those of ``from_falloff`` come back to the bit for as long as they do not change.
         """
         values = torch.sigmoid(self.logits.clamp(LOGIT_MIN, LOGIT_MAX))
-        if (given := self._given_values()) is None:
+        if (given := self._known(self._given)) is None:
             return values
         return values + (given - values).detach()  # exact: they are neighbours
 
-    def _given_values(self) -> Tensor | None:
-        """The thresholds that ``from_falloff`` got, unless the logits have changed since."""
-        if self._given is None:
+    def _note(self, known: Known) -> _Noted[Known] | None:
+        """Note something of the logits as they are; in inference mode they have no version."""
+        return None if self.logits.is_inference() else (self.logits, self.logits._version, known)
+
+    def _known(self, noted: _Noted[Known] | None) -> Known | None:
+        """What was noted, unless the logits have changed since."""
+        if noted is None or noted[0] is not self.logits or noted[1] != self.logits._version:
             return None
-        logits, version, values = self._given
-        return values if logits is self.logits and version == logits._version else None
+        return noted[2]
 
     def _place_values(self, values: Tensor) -> None:
         """Set thresholds (N,) whose sigmoid is not rounded back: files get the bits they gave."""
@@ -130,15 +138,18 @@ class ThresholdStore:
         self.place(torch.where(values <= neutral, logits.clamp_max(NEUTRAL_LOGIT), logits))
         near = self.logits.detach().sigmoid()
         same = (values - near).abs() <= _ROUNDING * near
-        if not self.logits.is_inference():  # made in inference mode, it has no version
-            self._given = self.logits, self.logits._version, torch.where(same, values, near)
+        self._given = self._note(torch.where(same, values, near))
 
     @property
     def neutral(self) -> bool:
         """True while no threshold decides anything. Rows are read once after each change."""
-        if not self._is_known():
-            self._look()
-        return self._neutral
+        return self._look()[0]
+
+    def _look(self) -> tuple[bool, bool]:
+        if (seen := self._known(self._seen)) is None:
+            seen = bool((self.logits <= NEUTRAL_LOGIT).all()), False
+            self._seen = self._note(seen)
+        return seen
 
     @property
     def rules(self) -> dict[str, Any]:
@@ -167,22 +178,8 @@ class ThresholdStore:
     @property
     def opened(self) -> bool:
         """True if ``open`` would change nothing, because it was called and no row is neutral."""
-        return self._is_known() and self._opened
-
-    def _is_known(self) -> bool:
-        """Whether the logits are unchanged since they were last read."""
-        return self._seen is not None and (
-            self._seen[0] is self.logits and self._seen[1] == self.logits._version
-        )
-
-    def _look(self, opened: bool = False) -> None:
-        self._know(bool((self.logits <= NEUTRAL_LOGIT).all()), opened)
-
-    def _know(self, neutral: bool, opened: bool) -> None:
-        """Remember for the present logits whether all rows are neutral, and whether none is."""
-        self._neutral, self._opened = neutral, opened
-        counted = not self.logits.is_inference()  # made in inference mode, they have no version
-        self._seen = (self.logits, self.logits._version) if counted else None
+        seen = self._known(self._seen)
+        return seen is not None and seen[1]
 
     def open(self, opacities: Tensor) -> None:
         """Start learning: neutral rows move to just below the skip limit 1/(255 o).
@@ -202,19 +199,19 @@ class ThresholdStore:
         with torch.no_grad():
             neutral = self.logits <= NEUTRAL_LOGIT
             self.logits.copy_(torch.where(neutral, start, self.logits))
-        self._look(opened=True)
+        self._seen = self._note((not len(self), True))
 
     def step(self, lr: float | None = None) -> None:
         """Make one optimizer step with the gradient gathered since the last one, and clear it."""
         if lr is not None:
             self.optimizer.param_groups[0]["lr"] = lr
-        learning = not self.neutral
+        neutral, opened = self._look()
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         self.place(self.logits)
         self.steps += 1
-        if learning:  # no step comes near the 24 logits from the skip limit down to neutral
-            self._know(neutral=False, opened=self._opened)
+        if not neutral:  # no step comes near the 24 logits from the skip limit down to neutral
+            self._seen = self._note((False, opened))
 
     @torch.no_grad()
     def place(self, logits: Tensor) -> None:
@@ -226,8 +223,8 @@ class ThresholdStore:
         device = self.logits.device if device is None else device
         other = ThresholdStore(0, device, self.optimizer.param_groups[0]["lr"])
         other.load_state_dict(self.state_dict())
-        if (given := self._given_values()) is not None:
-            other._given = other.logits, other.logits._version, given.to(other.logits.device)
+        if (given := self._known(self._given)) is not None:
+            other._given = other._note(given.to(other.logits.device))
         return other
 
     def __deepcopy__(self, memo: object) -> ThresholdStore:
@@ -349,7 +346,7 @@ class ThresholdStore:
 
     def _resize(self, change: Any, tail: Tensor | None = None) -> None:
         """Apply a row operation to logits and moments alike; tail overwrites the last logits."""
-        old, given = self.optimizer.state.get(self.logits), self._given_values()
+        old, given = self.optimizer.state.get(self.logits), self._known(self._given)
         lr = self.optimizer.param_groups[0]["lr"]
         logits = change(self.logits.detach())
         if tail is not None and len(tail):
@@ -358,7 +355,7 @@ class ThresholdStore:
         if old:
             self._set_moments(change(old["exp_avg"]), change(old["exp_avg_sq"]), old["step"])
         if given is not None and tail is None:
-            self._given = self.logits, self.logits._version, change(given)
+            self._given = self._note(change(given))
 
     def _rows(self, rows: Tensor, count: int, operation: str) -> Tensor:
         rows = torch.as_tensor(rows, dtype=torch.int64, device=self.logits.device)
