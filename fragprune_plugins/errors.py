@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from typing import ClassVar
+
 
 def printable(text: str) -> str:
     """A text with escapes for what would control a terminal, or cannot be encoded.
@@ -23,7 +26,13 @@ class FragpruneError(Exception):
         remedy: the next thing to do, in the imperative.
     """
 
-    code = "error"
+    code: ClassVar[str] = "error"
+
+    def __init_subclass__(cls) -> None:
+        """Without a code of its own an error is called after its class: ``model-file``."""
+        if "code" not in vars(cls):
+            words = re.findall("[A-Z][a-z]*", cls.__name__.removesuffix("Error"))
+            cls.code = "-".join(words).lower()
 
     def __init__(self, where: str, found: str, expected: str, remedy: str) -> None:
         self.where, self.found = printable(where), printable(found)
@@ -40,31 +49,21 @@ class FragpruneError(Exception):
 class ModelFileError(FragpruneError):
     """A PLY that is missing, truncated, empty, not finite, or not a Gaussian splat."""
 
-    code = "model-file"
-
 
 class DatasetError(FragpruneError):
     """Photographs or cameras that are missing, of an unknown kind, or do not match each other."""
-
-    code = "dataset"
 
 
 class SidecarError(FragpruneError):
     """A sidecar that is lost, broken, not finite, or belongs to another model."""
 
-    code = "sidecar"
-
 
 class CheckpointError(FragpruneError):
     """A fine-tuning's checkpoint that is broken, not finite, or of another fine-tuning."""
 
-    code = "checkpoint"
-
 
 class OutputError(FragpruneError):
     """A place that cannot be written."""
-
-    code = "output"
 
 
 class AlignmentError(FragpruneError):
@@ -76,85 +75,57 @@ class AlignmentError(FragpruneError):
 class UnknownHostError(FragpruneError):
     """No adapter fits the codebase."""
 
-    code = "unknown-host"
-
 
 class HostNeedsError(FragpruneError):
     """Packages that a host imports, or the data it is to read, are missing."""
-
-    code = "host-needs"
 
 
 class HostFailed(FragpruneError):  # noqa: N818 - the host's failure, reported
     """The host's script raised, or ended with a non-zero exit code."""
 
-    code = "host-failed"
-
 
 class ProofError(FragpruneError):
     """A host's own rasterizer draws, or differentiates, otherwise than our engine does."""
-
-    code = "proof"
 
 
 class SeamError(FragpruneError):
     """A host lacks a function that we wrap, or the function has other parameters."""
 
-    code = "seam"
-
 
 class LateImportError(FragpruneError):
     """The host imported a function that we must wrap before we were activated."""
-
-    code = "late-import"
 
 
 class SessionError(FragpruneError):
     """Activation out of order: a second session while one is active, or no active session."""
 
-    code = "session"
-
 
 class RanksError(FragpruneError):
     """Several processes (torchrun, DDP) that cannot learn one model together, or parted."""
-
-    code = "ranks"
 
 
 class EngineError(FragpruneError):
     """No engine on this machine can do the task."""
 
-    code = "engine"
-
 
 class KernelError(EngineError):
     """Kernels cannot be compiled for a GPU, or loaded into it."""
-
-    code = "kernel"
 
 
 class InputError(FragpruneError):
     """Tensors of the wrong shape, dtype or device."""
 
-    code = "input"
-
 
 class PluginError(FragpruneError):
     """A plugin that raised in a hook, or gave an answer that cannot be used."""
-
-    code = "plugin"
 
 
 class RecordError(FragpruneError):
     """There is no record to report, or a record cannot be read."""
 
-    code = "record"
-
 
 class PathError(FragpruneError):
     """A path that the system refuses: too long a name, no permission, no space left."""
-
-    code = "path"
 
 
 class MemoryLimitError(FragpruneError):
@@ -165,8 +136,6 @@ class MemoryLimitError(FragpruneError):
 
 class NotComparedError(FragpruneError):
     """A host's run cannot be measured on its held-out views."""
-
-    code = "not-compared"
 
 
 class DivergedError(FragpruneError):
@@ -184,16 +153,10 @@ class ResetError(FragpruneError):
 class UsageError(FragpruneError):
     """Options that contradict each other; exit code 2."""
 
-    code = "usage"
-
 
 class Interrupted(FragpruneError):  # noqa: N818 - a person's wish, not a fault
     """Ctrl-C during stage 2; the learned values are saved first. Exit code 130."""
 
-    code = "interrupted"
-
 
 class Terminated(Interrupted):
     """SIGTERM during stage 2; the learned values are saved first. Exit code 143."""
-
-    code = "terminated"
