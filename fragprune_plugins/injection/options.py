@@ -13,6 +13,7 @@ from fragprune_plugins.errors import NotComparedError
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.learning.events import Summary
 from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.types import one_line
 
 Stage = Literal["auto", "finetune", "joint", "off"]
 
@@ -28,6 +29,7 @@ class Found:
 
     settings: Settings
     kept: Tensor | None = None
+    __repr__ = one_line
 
 
 Look = Callable[[Path, Photographs, Settings], Found]
