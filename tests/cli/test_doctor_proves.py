@@ -11,16 +11,19 @@ from cli.commands import run
 from fragprune_graphdeco import GraphdecoDialect, stand_ins
 from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.engines.cpu.engine import CpuEngine
+from fragprune_plugins.engines.cuda import comparison
 from fragprune_plugins.errors import EngineError
 from fragprune_plugins.workbench.doctor import peers, prove
 from fragprune_plugins.workbench.doctor.prove import Contestant
 
 PACKAGE = "diff_gaussian_rasterization"
+EMULATION = {"compiler": "g++", "not_proved": None, "differences": [], "scenes": []}
 
 
 @pytest.fixture(autouse=True)
 def _small(monkeypatch):
     monkeypatch.setattr(prove, "SCENES", {"cpu": ((300, (48, 32)),)})
+    monkeypatch.setattr(prove, "_emulation", lambda say: EMULATION)  # gpu/test_proof.py has it
 
 
 class Wrong(CpuEngine):
@@ -57,6 +60,7 @@ def test_every_engine_here_agrees_and_is_timed():
     result = run("doctor", "--prove", "--json")
     assert result.exit_code == 0, result.stdout
     proof = json.loads(result.stdout, parse_constant=pytest.fail)
+    assert proof["format"] == "fragprune-proof 2"
     builds = [f"cpu ({build})" for build in binding.usable_builds()]
     assert [check["name"] for check in proof["checks"]] == builds
     assert all(check["differences"] == [] for check in proof["checks"])
@@ -73,7 +77,26 @@ def test_who_draws_otherwise_is_named_and_not_timed(monkeypatch, change):
     assert report.exit_code == 1
     assert [bool(check["differences"]) for check in report.data["checks"]] == [True, False]
     assert {row["engine"] for row in report.data["times"]} == {"right"}
-    assert "wrong: with thresholds" in report.text
+    assert "wrong: cutoffs, " in report.text
+
+
+def test_what_nobody_held_is_said_and_is_no_success(monkeypatch):
+    monkeypatch.undo()
+    monkeypatch.setattr(prove, "SCENES", {"cpu": ()})
+    monkeypatch.setattr(prove, "find_compiler", lambda: None)
+    report = prove.prove(lambda text: None)
+    assert report.exit_code == 1
+    assert report.data["emulation"]["not_proved"]
+    assert "cuda kernels, emulated: NOT PROVED, no C++17 compiler" in report.text
+
+
+def test_without_an_engine_of_ours_nothing_is_proved(monkeypatch):
+    monkeypatch.setattr(binding, "usable_builds", list)
+    monkeypatch.setattr(binding, "available", lambda: False)
+    monkeypatch.setattr(binding, "chosen", lambda: "not built")
+    report = prove.prove(lambda text: None)
+    assert report.exit_code == 1
+    assert "cpu: left out, not built" in report.text
 
 
 @pytest.fixture
@@ -97,7 +120,7 @@ def host(monkeypatch):
 
 def test_a_hosts_own_rasterizer_that_agrees_is_timed_in_turns(host):
     peer = Contestant("host", peers.peer(PACKAGE), ours=False)
-    assert list(prove._check(peer, "cpu")) == []
+    assert prove._check(peer, "cpu")["differences"] == []
     ours = Contestant("ours", CpuEngine())
     rows = list(prove._times([ours, peer], "cpu", 2, lambda text: None))
     assert [row["engine"] for row in rows if row["round"] == "peers"] == ["ours", "host"] * 2
@@ -108,7 +131,7 @@ def test_a_hosts_own_rasterizer_that_agrees_is_timed_in_turns(host):
 def test_a_hosts_rasterizer_that_draws_otherwise_is_named(host):
     host[0][0] = 1.05
     peer = Contestant("host", peers.peer(PACKAGE), ours=False)
-    (picture, *gradients) = prove._check(peer, "cpu")
+    (picture, *gradients) = prove._check(peer, "cpu")["differences"]
     assert "another picture" in picture
     assert any("gradient of sh" in line for line in gradients)
 
@@ -118,11 +141,11 @@ def test_another_rasterizer_by_the_same_name_is_refused(host):
     module = stand_ins.rasterizer(PACKAGE, fields, False, None)
     host[1].GaussianRasterizationSettings = module.GaussianRasterizationSettings
     peer = peers.peer(PACKAGE)
-    (said,) = prove._check(Contestant("host", peer, ours=False), "cpu")
+    (said,) = prove._check(Contestant("host", peer, ours=False), "cpu")["differences"]
     assert "kernel_size" in said
 
 
 def test_a_peer_takes_no_thresholds(host):
-    inputs, cut = prove.comparison.scene(20, (16, 16), 2.0)
+    inputs, cut = comparison.scene(20, (16, 16), 2.0)
     with pytest.raises(EngineError, match="Leave them out"):
         peers.peer(PACKAGE).rasterize(inputs, torch.as_tensor(cut))

@@ -5,10 +5,10 @@ import shutil
 from pathlib import Path
 
 import pytest
-from gpu.emulated import EmulatedDevice
 
 from fragprune_plugins.engines.cuda import kernels
 from fragprune_plugins.engines.cuda.engine import CudaEngine
+from fragprune_plugins.workbench.doctor.emulated import EmulatedDevice
 
 
 @pytest.fixture(scope="session")

@@ -16,7 +16,7 @@ from unittest import mock
 
 import scenes
 import torch
-from gpu.emulated import BrokenDevice, EmulatedDevice, Numbers
+from gpu.emulated import BrokenDevice, Numbers
 from native.test_dialects import dialect
 from native.test_invariants import everything
 from spacetime import cut, moment, splats
@@ -24,6 +24,7 @@ from spacetime import cut, moment, splats
 from fragprune_plugins.engines.cuda import frame
 from fragprune_plugins.engines.cuda.engine import CudaEngine
 from fragprune_plugins.types import RasterInputs
+from fragprune_plugins.workbench.doctor.emulated import EmulatedDevice
 
 KINDS = {
     "thread": (
@@ -94,13 +95,13 @@ def draw(device: EmulatedDevice, seed: int) -> None:
     thresholds = scenes.random_thresholds(seed, len(inputs.splats))
     for deterministic in (False, True):
         engine = CudaEngine(device, deterministic=deterministic)
-        engine._capacity = 1 << 12
+        engine.capacity = 1 << 12
         everything(engine, inputs, thresholds)
         everything(engine, scenes.random_scene(seed, 700, 70, 50), None)
         everything(engine, scenes.stack([0.3, 0.9, 0.999, 0.5] * 90), None)
         everything(engine, poisoned(scenes.random_scene(seed, 60, 1, 1), seed), None)
     engine = CudaEngine(device)
-    engine._capacity = 7
+    engine.capacity = 7
     engine.rasterize(scenes.random_scene(seed, 300, 330, 290, scale_modifier=3.0), None)
     engine.rasterize(scenes.empty(), None)
     given = splats(("joint", "apart", "still", "sliced")[seed % 4], 300)

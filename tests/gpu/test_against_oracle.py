@@ -10,7 +10,6 @@ from dataclasses import replace
 import pytest
 import scenes
 import torch
-from gpu.emulated import EmulatedDevice
 from native.test_against_oracle import (
     check_gradients,
     draw_pair,
@@ -26,6 +25,7 @@ from fragprune_plugins.engines.cpu.engine import CpuEngine
 from fragprune_plugins.engines.cuda import frame
 from fragprune_plugins.engines.cuda.engine import CudaEngine
 from fragprune_plugins.errors import EngineError, InputError
+from fragprune_plugins.workbench.doctor.emulated import EmulatedDevice
 
 # those of the cpu engine, over this one
 __all__ = [
@@ -150,9 +150,9 @@ def test_larger_scenes_equal_the_cpu_engine(
 def test_lists_that_do_not_fit_are_drawn_again_with_more_room(device: EmulatedDevice) -> None:
     inputs, thresholds = scenes.random_scene(0), scenes.random_thresholds(0, 60)
     whole, small = CudaEngine(device), CudaEngine(device)
-    small._capacity = 7
+    small.capacity = 7
     expected, found = (everything(e, inputs, thresholds) for e in (whole, small))
-    assert small._capacity > 60
+    assert small.capacity > 60
     for name in ("image", "alpha", "radii"):
         assert torch.equal(expected[name], found[name]), name
 

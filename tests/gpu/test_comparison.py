@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from gpu.emulated import EmulatedDevice
 from gpu.holding import Holding
 
 from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.engines.cuda import comparison, frame
 from fragprune_plugins.engines.cuda import engine as cuda
 from fragprune_plugins.engines.cuda.comparison import Workload, compare
+from fragprune_plugins.workbench.doctor.emulated import EmulatedDevice
 
 CPU = torch.device("cpu")
 SMALL = Workload(
@@ -60,7 +60,7 @@ def memory(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.fixture(autouse=True)
 def _little_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cuda, "_FIRST_CAPACITY", 1 << 13)  # the emulation is slow
+    monkeypatch.setattr(cuda.CudaEngine, "capacity", 1 << 13)  # the emulation is slow
 
 
 def test_a_sound_engine_agrees(device: EmulatedDevice) -> None:

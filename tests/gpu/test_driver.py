@@ -12,12 +12,12 @@ from pathlib import Path
 import pytest
 import scenes
 import torch
-from gpu.emulated import EmulatedDevice
 from gpu.test_compile import nvrtc
 from native.test_invariants import everything
 
 from fragprune_plugins.engines.cuda import kernels
 from fragprune_plugins.engines.cuda.engine import CudaEngine
+from fragprune_plugins.workbench.doctor.emulated import EmulatedDevice
 
 __all__ = ["nvrtc"]
 

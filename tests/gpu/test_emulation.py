@@ -2,7 +2,9 @@
 
 import pytest
 import torch
-from gpu.emulated import BrokenDevice, EmulatedDevice, Numbers
+from gpu.emulated import BrokenDevice, Numbers
+
+from fragprune_plugins.workbench.doctor.emulated import EmulatedDevice
 
 
 @pytest.fixture(scope="module")

@@ -8,11 +8,11 @@ from dataclasses import replace
 
 import pytest
 import scenes
-from gpu.emulated import EmulatedDevice
 from gpu.holding import Holding
 
 from fragprune_plugins.engines.cuda import engine as cuda
 from fragprune_plugins.engines.cuda.engine import CudaEngine
+from fragprune_plugins.workbench.doctor.emulated import EmulatedDevice
 
 
 @contextmanager
@@ -41,7 +41,7 @@ def drawings(monkeypatch: pytest.MonkeyPatch) -> list[weakref.ref]:
 
 
 def step(engine: CudaEngine, counts: bool = False, backward: bool = True) -> None:
-    engine._capacity = 512  # the emulation is slow
+    engine.capacity = 512  # the emulation is slow
     made, _ = scenes.leaves(scenes.random_scene(0, features=3))
     made = replace(made, counts=True) if counts else made
     out = engine.rasterize(made, scenes.random_thresholds(0, 60).requires_grad_())

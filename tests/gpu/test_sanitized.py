@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 from gpu import sanitized
-from gpu.emulated import EmulatedDevice
+
+from fragprune_plugins.workbench.doctor.emulated import EmulatedDevice
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 

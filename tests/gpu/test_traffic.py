@@ -1,14 +1,18 @@
 """What is counted of memory's traffic, against numbers by hand; a block has 8 warps."""
 
+from pathlib import Path
+
 import pytest
 import torch
-from gpu.emulated import HERE, EmulatedDevice, Numbers
+from gpu.emulated import HERE, Numbers
 from gpu.traffic import KINDS, CountingDevice
+
+from fragprune_plugins.workbench.doctor.emulated import EmulatedDevice
 
 
 class Patterns(CountingDevice):
-    def source(self, name: str) -> str:
-        return str(HERE / "patterns.cu")
+    def source(self, name: str) -> Path:
+        return HERE / "patterns.cu"
 
 
 @pytest.fixture(scope="module")

@@ -18,11 +18,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from gpu.emulated import EmulatedDevice
+from gpu.emulated import HERE
 
 from fragprune_plugins.engines.cuda.engine import CudaEngine
 from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.bench.scene import make_scene, make_view
+from fragprune_plugins.workbench.doctor.emulated import EMULATION, EmulatedDevice
 
 KINDS = ("read", "write", "atomic", "shared")
 FIGURES = ("requests", "lanes", "units", "least")
@@ -48,10 +49,13 @@ class CountingDevice(EmulatedDevice):
         self._open(source, macros).emulated_traffic(counts.ctypes.data_as(ctypes.c_void_p))
         self.traffic[kernel] += counts
 
-    def _compile(self, path: Path, *kernels: str) -> None:
+    def _compile(self, path: Path, *text: str) -> None:
         seen = path.with_suffix(".o")
-        self._build(seen, "-c", "-fsanitize=thread", "-fno-tree-sra", *kernels)
-        self._build(path, "-shared", self._part("emulation"), self._part("traffic"), str(seen))
+        self._build(seen, "-c", "-fsanitize=thread", "-fno-tree-sra", *text)
+        parts = (
+            self._part(source) for source in (EMULATION / "emulation.cpp", HERE / "traffic.cpp")
+        )
+        self._build(path, "-shared", *parts, str(seen))
 
 
 def row(traffic: np.ndarray[Any, Any]) -> dict[str, float]:

@@ -14,9 +14,6 @@ from fragprune_plugins.engines.cuda.frame import Device, Drawing
 from fragprune_plugins.errors import EngineError, InputError
 from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats
 
-_FIRST_CAPACITY = 1 << 20
-"""Entries of the tiles' lists that there is room for before any frame has told."""
-
 
 class CudaEngine:
     """Rasterizes on a GPU with kernels that are compiled at first use.
@@ -26,16 +23,19 @@ class CudaEngine:
         deterministic: make gradients the same to the bit in each run, at the cost of time and
             memory; None follows torch.use_deterministic_algorithms. Images are always the same.
 
+    Attributes:
+        capacity: entries of the tiles' lists that there is room for; grows with what frames need.
+
     Raises:
         EngineError: kernels cannot be compiled or run here; the message says why.
     """
 
     name = "cuda"
+    capacity = 1 << 20
 
     def __init__(self, device: Device | None = None, *, deterministic: bool | None = None) -> None:
         self.device = Driver() if device is None else device
         self._deterministic = deterministic
-        self._capacity = _FIRST_CAPACITY
 
     def rasterize(self, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
         """Draw the splats; thresholds is (N,) falloff in (0, 1), or None for no truncation.
@@ -88,7 +88,7 @@ class CudaEngine:
         if deterministic is None:
             deterministic = torch.are_deterministic_algorithms_enabled()
         while True:
-            drawn = drawing.draw(self._capacity, wanted, deterministic=deterministic)
-            if (entries := drawing.read()) <= self._capacity:
+            drawn = drawing.draw(self.capacity, wanted, deterministic=deterministic)
+            if (entries := drawing.read()) <= self.capacity:
                 return drawn
-            self._capacity = entries + entries // 4
+            self.capacity = entries + entries // 4

@@ -136,7 +136,7 @@ def unblend_macros(
 
 
 class Device(Hashable, Protocol):
-    """Runs kernels by name: a GPU, or an emulation in tests.
+    """Runs kernels by name: a GPU, or its emulation.
 
     Attributes:
         kind: torch's name for the type of device that the tensors live on.

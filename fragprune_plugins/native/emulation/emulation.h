@@ -1,8 +1,8 @@
-// The execution model of a GPU on one CPU thread, for tests: the kernels' sources, unchanged, run
-// under g++. A block's threads are fibers, which run in random order from one barrier or warp
-// operation to the next; a few blocks are under way at a time, taken from the grid and continued in
-// random order; shared memory is filled with NaN before each block. What works in one order only,
-// or reads what nobody wrote, shows.
+// The execution model of a GPU on one CPU thread: the kernels' sources, unchanged, run as C++. A
+// block's threads are fibers, which run in random order from one barrier or warp operation to the
+// next; a few blocks are under way at a time, taken from the grid and continued in random order;
+// shared memory is filled with NaN before each block. What works in one order only, or reads what
+// nobody wrote, shows.
 //
 // Under ThreadSanitizer it knows what a GPU promises, and no more: fibers are threads, barriers and
 // __syncwarp order what lies before and after them; shuffles, votes and atomics order nothing. So it
