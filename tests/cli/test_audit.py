@@ -53,6 +53,14 @@ def test_the_page_stands_alone_and_quotes_the_result(audited):
     assert report["cameras"]["why"] in page
 
 
+def test_tables_fit_a_terminal_and_lose_no_word(model):
+    text = run("audit", model, "--views", 1, "--resolution", 16).stdout
+    tables = [each.splitlines() for each in text.split("\n\n") if each.count("\n") > 2]
+    assert len(tables) == 4
+    assert max(len(line) for table in tables for line in table) <= 100
+    assert {"Spark,", "Babylon.js", "GaussianSplatMesh"} <= set(text.split())
+
+
 def test_maps_have_the_views_pixels_and_one_scale(audited):
     out, report = audited
     limit = report["maps"]["limit"]

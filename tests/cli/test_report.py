@@ -2,6 +2,7 @@
 
 import base64
 import json
+import re
 import shutil
 import sys
 
@@ -210,6 +211,9 @@ def test_a_run_that_was_not_measured_reports_its_training_views(tmp_path, goal, 
         "my-host, 5 iterations: 2.50x fewer fragments (30.0 -> 12.0 per pixel) on training views; "
         f"frame times were not measured{said}"
     )
+    page = (tmp_path / "report.html").read_text()
+    assert "fragments_per_pixel_" not in page
+    assert re.search(r"fragments per pixel.*30\.00.*12\.00", page, re.DOTALL)
 
 
 def test_a_folder_of_controls_alone_is_named_as_one(folder, tmp_path):

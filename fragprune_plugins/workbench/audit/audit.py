@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -225,15 +225,17 @@ def audit(
     """
     survey = _Survey(model, engine)
     chosen = _amid(len(views))
-    with tqdm(total=2 * len(views) + 1, desc="audit", unit="step", disable=not progress) as bar:
+    each = max(1, tiles // len(views))
+    steps = each + 1  # of a view: the pictures, then the tiles, of which small ones have fewer
+    with tqdm(total=steps * len(views), desc="audit", unit="tile", disable=not progress) as bar:
         for number, (name, view) in enumerate(views):
             survey.draw(name, view, shown=number in chosen)
             bar.update()
-            survey.weigh(view, max(1, tiles // len(views)))
-            bar.update()
-        timed: list[View] = [views[number][1] for number in chosen]
-        frames = frame_times(list(survey.candidates.values()), timed, engine, repeats=repeats)
-        bar.update()
+            for _ in survey.weigh(view, each):
+                bar.update()
+            bar.update(steps * (number + 1) - bar.n)
+    timed: list[View] = [views[number][1] for number in chosen]
+    frames = frame_times(list(survey.candidates.values()), timed, engine, repeats=repeats)
     return survey.figures(frames), survey.shown
 
 
@@ -285,8 +287,8 @@ class _Survey:
             assert ellipses.fragments is not None
             self.shown.append(Shown(name, itself.image, itself.fragments, ellipses.fragments))
 
-    def weigh(self, view: View, tiles: int) -> None:
-        """Weigh the fragments of some tiles of the view that was drawn last, one by one."""
+    def weigh(self, view: View, tiles: int) -> Iterator[None]:
+        """Weigh the fragments of the view that was drawn last, one by one; some tiles, in turns."""
         opacities, radii = self._splats.opacities, self._radii
         candidate = self.candidates[AS_IT_IS]
         inputs = candidate.inputs(view, self._splats)
@@ -295,6 +297,7 @@ class _Survey:
         for tile in fragments(inputs, candidate.thresholds(inputs), tiles):
             if len(tile.rows):
                 self._idle.add(kinds[tile.rows], weigh(tile, view.background))
+            yield
 
     def figures(self, frames: Sequence[dict[str, Any]]) -> dict[str, Any]:
         """Everything as plain values, with the frame times of each candidate."""

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,9 @@ MEASURED = (
 """What pruning without photographs gained; docs/how-to/without-photographs.md has the table."""
 
 _TEMPLATE = Path(__file__).with_name("audit.html")
+
+_WORDS = 28
+"""Characters of a line of words in a terminal: two such columns and two of numbers fill 100."""
 
 _KINDS = ("", "_fragments", "_overdraw")
 
@@ -83,17 +88,31 @@ def text(figures: Mapping[str, Any]) -> str:
     """What a terminal shows."""
     lines = [sentence(figures), "", figures["cameras"]["why"], ""]
     for title, table in zip(_TITLES, _tables(figures), strict=True):
-        lines.append(f"{title}:")
-        lines_of = (table.head, *table.rows)
-        widths = [max(map(len, column)) for column in zip(*lines_of, strict=True)]
-        for row in lines_of:
+        lines += [f"{title}:", *_folded(table), ""]
+    return "\n".join([*lines, pruning(figures)])
+
+
+def _folded(table: page.Table) -> list[str]:
+    """The lines of a table in a terminal; long words fold."""
+    rows = [
+        [
+            textwrap.wrap(cell, _WORDS) or [cell] if at < table.words else [cell]
+            for at, cell in enumerate(row)
+        ]
+        for row in (table.head, *table.rows)
+    ]
+    widths = [
+        max(len(line) for cell in column for line in cell) for column in zip(*rows, strict=True)
+    ]
+    lines = []
+    for row in rows:
+        for parts in zip_longest(*row, fillvalue=""):
             cells = [
-                cell.ljust(width) if at < table.words else cell.rjust(width)
-                for at, (cell, width) in enumerate(zip(row, widths, strict=True))
+                part.ljust(width) if at < table.words else part.rjust(width)
+                for at, (part, width) in enumerate(zip(parts, widths, strict=True))
             ]
             lines.append("  ".join(cells).rstrip())
-        lines.append("")
-    return "\n".join([*lines, pruning(figures)])
+    return lines
 
 
 def compose(figures: Mapping[str, Any], folder: Path) -> str:

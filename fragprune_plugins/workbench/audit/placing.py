@@ -21,6 +21,7 @@ from torch import Tensor
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.types import RasterInputs, Splats, View
+from fragprune_plugins.workbench.figures.evaluate import bar
 from fragprune_plugins.workbench.scenes.generated import Named, around, bounds, within
 from fragprune_plugins.workbench.scenes.pinhole import look_at
 
@@ -78,7 +79,8 @@ def place(
         return Placed(_orbit(splat, count, pixels, engine), side, "As asked for.", math.nan)
     splats, near = splat.splats(), _NEAR * bounds(splat)[1]
     places = _clear(splat, near / _NEAR)
-    shares = [enclosed(engine, splats, at, near) for at in places]
+    looked = bar(places, "looking from inside")
+    shares = [enclosed(engine, splats, at, near) for at in looked]
     best = max(shares)
     if side == "auto" and best <= ENCLOSED:
         why = (
@@ -98,7 +100,8 @@ def place(
             "hollow object, pass --orbit."
         )
     views = within(eyes, 2 * count, pixels=pixels)
-    seen = [float(_met(engine, splats, _small(view), near).mean()) for _, view in views]
+    small = bar([_small(view) for _, view in views], "choosing cameras")
+    seen = [float(_met(engine, splats, view, near).mean()) for view in small]
     half = sorted(seen, reverse=True)[count - 1]  # doors and open sides show nothing
     chosen = [view for view, share in zip(views, seen, strict=True) if share >= half]
     return Placed(chosen[:count], "inside", why, best)
@@ -110,13 +113,10 @@ def _orbit(splat: Model, count: int, pixels: int, engine: Engine) -> Named:
     From above is where y is less: worlds of COLMAP, which most are, have y down.
     """
     centre, splats = bounds(splat)[0], splat.splats()
-    return sorted(
-        around(splat, count, pixels=pixels),
-        key=lambda named: (
-            bool(named[1].campos[1] > centre[1]),
-            -_detail(engine, splats, named[1]),
-        ),
-    )
+    named = around(splat, count, pixels=pixels)
+    looked = bar(named, "choosing cameras")
+    details = {name: _detail(engine, splats, view) for name, view in looked}
+    return sorted(named, key=lambda each: (bool(each[1].campos[1] > centre[1]), -details[each[0]]))
 
 
 def _detail(engine: Engine, splats: Splats, view: View) -> float:

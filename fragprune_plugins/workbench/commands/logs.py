@@ -225,7 +225,7 @@ def log_option(function: Function) -> Function:
         metavar="KIND:PLACE",
         callback=_places,
         multiple=True,
-        help="Write every step's loss, fragments, pressure and threshold to csv:FILE, "
+        help="Write every step's loss, fragments, pressure and cutoff to csv:FILE, "
         "tensorboard:FOLDER or wandb:PROJECT, or as a plugin does. May be given several times.",
     )
     @functools.wraps(function)

@@ -127,7 +127,7 @@ def measure_all(
     reports: list[dict[str, Any]] = []
     for candidate, splats in zip(candidates, drawn, strict=True):
         rows, distances = [], []
-        for shot in _bar(shots, "measuring"):
+        for shot in bar(shots, "measuring"):
             outputs = candidate.draw(engine, shot.view, splats)
             seen = shot.looked_at(outputs.image)
             distances.append(lpips(seen, shot.image))
@@ -167,7 +167,7 @@ def measure_all(
     return reports
 
 
-def _bar(items: Sequence[Made], what: str) -> Iterable[Made]:
+def bar(items: Sequence[Made], what: str) -> Iterable[Made]:
     """The items, with a bar that shows how far they are; of several processes one shows it."""
     bar: Iterable[Made] = tqdm(items, what, leave=False, delay=SILENT, disable=not launched().first)
     return bar
@@ -210,7 +210,7 @@ def frame_times(
     drawn = [candidate.model.splats() for candidate in candidates]
     times: list[list[list[float]]] = [[] for _ in candidates]  # candidate, repeat, view
     turns = list(zip(candidates, drawn, times, strict=True))
-    for _ in _bar(range(repeats), "timing frames"):
+    for _ in bar(range(repeats), "timing frames"):
         for rounds in times:
             rounds.append([])
         for view in views:

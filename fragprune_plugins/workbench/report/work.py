@@ -146,8 +146,9 @@ def _table(record: Record) -> Table:
     columns = _columns(record)
     if columns:
         return report_page.figures(columns)
-    seen = record.data["training_views"].items()
-    return Table(["", "training views"], [[key, _number(value)] for key, value in seen])
+    seen = record.data["training_views"]
+    drawn = [_number(seen[f"fragments_per_pixel_{when}"]) for when in ("before", "after")]
+    return Table(["on training views", "before", "after"], [["fragments per pixel", *drawn]])
 
 
 def _number(value: float | None) -> str:
