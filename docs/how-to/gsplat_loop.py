@@ -41,9 +41,11 @@ import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from scipy.spatial import cKDTree  # noqa: E402
 
+from fragprune_plugins.files.model import Model  # noqa: E402
 from fragprune_plugins.files.ply import read_ply  # noqa: E402
 from fragprune_plugins.types import View  # noqa: E402
 from fragprune_plugins.workbench.finetune.losses import photometric_loss  # noqa: E402
+from fragprune_plugins.workbench.models.formats.ply import write_ply  # noqa: E402
 from fragprune_plugins.workbench.scenes.dataset import load_dataset  # noqa: E402
 
 SH_DEGREE = 1
@@ -137,10 +139,16 @@ def held_out() -> float:
 
 
 def export(name: str) -> None:
-    """gsplat's own PLY; thresholds that were learned go beside it."""
+    """A PLY; thresholds that were learned go beside it."""
     args.out.mkdir(parents=True, exist_ok=True)
-    tensors = {key: value.detach() for key, value in params.items()}
-    gsplat.export_splats(**tensors, save_to=str(args.out / f"{name}.ply"))
+    path, tensors = args.out / f"{name}.ply", {k: each.detach() for k, each in params.items()}
+    if hasattr(gsplat, "export_splats"):
+        gsplat.export_splats(**tensors, save_to=str(path))
+    else:  # gsplat 1.4 writes no PLY
+        names = ("means", "sh0", "shN", "opacities", "scales", "quats")
+        xyz, f_dc, f_rest, opacity, scaling, rotation = (tensors[each].cpu() for each in names)
+        write_ply(path, Model(xyz, f_dc, f_rest, opacity[:, None], scaling, rotation))
+        session.save(params, path)
 
 
 for step in range(args.steps + args.stage2):

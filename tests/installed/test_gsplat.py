@@ -429,8 +429,9 @@ def test_relocation_is_equation_nine_also_for_the_most_copies(session_on, count)
             assert new[row].tolist() == pytest.approx([0.5 * o / total] * 3, rel=1e-4)
 
 
-def documented(words: list[str]) -> str:
-    """What the loop prints."""
+def documented(folder: str, words: list[str]) -> str:
+    """What the loop prints, with the gsplat of this folder."""
+    sys.path.insert(0, folder)
     sys.argv, said = words, io.StringIO()
     with contextlib.redirect_stdout(said):
         runpy.run_path(words[0], run_name="__main__")
@@ -438,10 +439,14 @@ def documented(words: list[str]) -> str:
 
 
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
-def test_the_documented_loop_runs_and_exports_its_thresholds(photographs, tmp_path, strategy):
+def test_the_documented_loop_runs_and_exports_its_thresholds(
+    folder, photographs, tmp_path, strategy
+):
     def loop(*words: object) -> None:
         words = (LOOP, photographs, *words, "--strategy", strategy)
-        assert "fragments per pixel" in fresh(documented, [str(word) for word in words])
+        assert "fragments per pixel" in fresh(
+            documented, str(folder), [str(word) for word in words]
+        )
 
     loop(tmp_path, "--steps", 6, "--stage2", 6)
     before, after = (read_ply(tmp_path / f"{name}.ply") for name in ("trained", "finetuned"))
