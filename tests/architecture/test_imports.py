@@ -141,6 +141,7 @@ KNOWN = {
         "fragprune_plugins.learning.events",
         "fragprune_plugins.learning.interruption",
         "fragprune_plugins.learning.stage2",
+        "fragprune_plugins.learning.waiting",
         "fragprune_plugins.plugins.loading",
     },
 }

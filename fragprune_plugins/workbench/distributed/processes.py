@@ -18,9 +18,9 @@ from torch import Tensor
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.learning.interruption import Waiting
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.learning.waiting import Waiting
 from fragprune_plugins.workbench.distributed.sharded import ShardedEngine
 from fragprune_plugins.workbench.distributed.stage import SharedStage
 from fragprune_plugins.workbench.finetune.loop import Alone, Training

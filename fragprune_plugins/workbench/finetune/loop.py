@@ -19,11 +19,11 @@ from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.adam import make_adam
 from fragprune_plugins.learning.area import area_per_pixel
 from fragprune_plugins.learning.events import StepStats
-from fragprune_plugins.learning.interruption import Waiting, between_steps
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.stage2 import Stage2
 from fragprune_plugins.learning.targets import Target
 from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.learning.waiting import Waiting, between_steps
 from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.hooks import thresholds_for
 from fragprune_plugins.plugins.loading import installed
