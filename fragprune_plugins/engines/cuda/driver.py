@@ -119,18 +119,15 @@ class Driver:
             return self._contexts[index]
 
     def _function(self, index: int, source: str, macros: dict[str, int], kernel: str) -> Any:
-        module_key = (index, source, *sorted(macros.items()))
-        key = (kernel, *module_key)
-        function = self._functions.get(key)
-        if function is None:
-            with self._lock:
-                if module_key not in self._modules:
-                    self._modules[module_key] = self._load(index, source, macros)
-                function = self._call(
-                    "cuModuleGetFunction", self._modules[module_key], kernel.encode()
+        module = (index, source, *sorted(macros.items()))
+        with self._lock:
+            if module not in self._modules:
+                self._modules[module] = self._load(index, source, macros)
+            if (kernel, module) not in self._functions:
+                self._functions[kernel, module] = self._call(
+                    "cuModuleGetFunction", self._modules[module], kernel.encode()
                 )
-                self._functions[key] = function
-        return function
+            return self._functions[kernel, module]
 
     def _load(self, index: int, source: str, macros: dict[str, int]) -> Any:
         """Load machine code for this GPU, or PTX if its driver refuses the machine code."""

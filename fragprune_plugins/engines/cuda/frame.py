@@ -10,7 +10,7 @@ import ctypes
 import math
 from collections.abc import Callable, Hashable
 from functools import partial
-from typing import Final, NamedTuple, Protocol
+from typing import Final, Protocol
 
 import torch
 from torch import Tensor
@@ -226,38 +226,6 @@ def launch_sort(
         arguments.ticket += 4
 
 
-def refuse(entries: int, spread: float) -> None:
-    """Raise EngineError if the kernels cannot draw so many entries, or such large offsets."""
-    if entries > ENTRIES_MAX:
-        raise EngineError(
-            "engine 'cuda'",
-            f"{entries} entries in the tiles' lists",
-            f"at most {ENTRIES_MAX}",
-            "Draw fewer Gaussians or a smaller image.",
-        )
-    if not spread <= OFFSET_MAX:
-        raise EngineError(
-            "engine 'cuda'",
-            f"sample_offsets up to {spread}",
-            f"at most {OFFSET_MAX:g} pixels",
-            "Check the offsets.",
-        )
-
-
-class Memory(NamedTuple):
-    """The memory of one frame.
-
-    Attributes:
-        cleared: begins with zeros.
-        scratch: needed until the lists are made.
-        kept: what backward reads.
-    """
-
-    cleared: Arena
-    scratch: Arena
-    kept: Arena
-
-
 class Drawing:
     """One rasterization: its forward pass, the data kept for backward, its backward pass.
 
@@ -303,10 +271,11 @@ class Drawing:
         inputs, n, where = self._inputs, self._n, self.where
         tiles, pixels = self._across * self._down, inputs.view.width * inputs.view.height
         keep = bool(wanted)
-        memory = self._room(capacity, keep, keep and deterministic)
+        cleared, scratch, kept = self._room(capacity, keep, keep and deterministic)
         outputs = self._new_outputs()
         weights = torch.zeros(n, dtype=torch.int64, device=where) if inputs.scores else None
-        places = {k: arena[k] for arena in memory for k in arena.filled & _PLACES}
+        arenas = (cleared, scratch, kept)
+        places = {k: arena[k] for arena in arenas for k in arena.filled & _PLACES}
         frame = Frame(
             inputs=native_inputs(inputs, self._arrays, widen="thresholds" in wanted),
             outputs=binding.Outputs(**{name: address(each) for name, each in outputs.items()}),
@@ -318,7 +287,7 @@ class Drawing:
             weights=address(weights),
             **places,
         )
-        self._list(frame, memory)
+        self._list(frame, *arenas)
         macros = blend_macros(
             self._channels,
             counts=inputs.counts,
@@ -326,22 +295,26 @@ class Drawing:
             stop=inputs.stop is not None,
         )
         self._launch("blend", macros, "fp_blend", tiles, frame)
-        found = memory.cleared.tensor("counters", 4, torch.int64)
+        found = cleared.tensor("counters", 4, torch.int64)
         if keep:
             frame.outputs = binding.Outputs()  # backward does without
             self._frame = frame
-        self._memory = (memory.cleared, memory.kept)
+        self._memory = (cleared, kept)
         self._found = found
         per_pixel = (found[2].double() / pixels).float()
         weighed = None if weights is None else (weights.double() * 2.0**-32).float()
         return outputs | {"fragments_per_pixel": per_pixel, "weights_per_gaussian": weighed}
 
-    def _room(self, capacity: int, keep: bool, slots: bool) -> Memory:
+    def _room(self, capacity: int, keep: bool, slots: bool) -> tuple[Arena, Arena, Arena]:
         """The memory of a frame.
 
         Args:
             keep: backward will come.
             slots: each list entry has one, so that backward adds in a fixed order.
+
+        Returns:
+            Arrays that begin with zeros; those needed until the lists are made; and those that
+            backward reads.
         """
         n, where = self._n, self.where
         tiles = self._across * self._down
@@ -377,12 +350,11 @@ class Drawing:
             transmittance=4 * pixels * keep,
             stop=4 * pixels * keep,
         )
-        return Memory(cleared, scratch, kept)
+        return cleared, scratch, kept
 
-    def _list(self, frame: Frame, memory: Memory) -> None:
+    def _list(self, frame: Frame, cleared: Arena, scratch: Arena, kept: Arena) -> None:
         """Project the Gaussians, and list them by tile and depth."""
         n, capacity, passes = self._n, frame.capacity, self._passes
-        cleared, scratch, kept = memory
         keys = [scratch["entry_keys"], scratch["entry_keys_2"]]
         values = [kept["entry_values"], scratch["entry_values_2"]]
         if passes % 2:  # the last sorting pass of the entries must end in `kept`
@@ -421,7 +393,20 @@ class Drawing:
         """
         _, entries, _, self.evaluated = map(int, self._found.tolist())
         self.entries = entries
-        refuse(entries, 0.0 if self._spread is None else float(self._spread))
+        if entries > ENTRIES_MAX:
+            raise EngineError(
+                "engine 'cuda'",
+                f"{entries} entries in the tiles' lists",
+                f"at most {ENTRIES_MAX}",
+                "Draw fewer Gaussians or a smaller image.",
+            )
+        if self._spread is not None and not self._spread <= OFFSET_MAX:
+            raise EngineError(
+                "engine 'cuda'",
+                f"sample_offsets up to {float(self._spread)}",
+                f"at most {OFFSET_MAX:g} pixels",
+                "Check the offsets.",
+            )
         return entries
 
     def _new_outputs(self) -> dict[str, Tensor | None]:

@@ -199,12 +199,6 @@ def digest_of_sources() -> bytes:
     return digest.digest()
 
 
-def _name_of(by: Nvrtc, source: str, macros: dict[str, int], target: str) -> str:
-    what = repr((by.name, by.version, _OPTIONS, source, sorted(macros.items()), target))
-    digest = hashlib.sha256(digest_of_sources() + what.encode()).hexdigest()[:24]
-    return f"{source}-{target}-{digest}"
-
-
 def image_of(
     source: str, macros: dict[str, int], target: str, by: Nvrtc | None = None
 ) -> tuple[Image, bool]:
@@ -221,7 +215,9 @@ def image_of(
         Unavailable: there is no compiler, or the source does not compile.
     """
     by = compiler() if by is None else by
-    path = cache_folder() / f"{_name_of(by, source, macros, target)}.bin"
+    what = repr((by.name, by.version, _OPTIONS, source, sorted(macros.items()), target))
+    digest = hashlib.sha256(digest_of_sources() + what.encode()).hexdigest()[:24]
+    path = cache_folder() / f"{source}-{target}-{digest}.bin"
     with ExitStack() as alone:
         with suppress(OSError, OutputError):  # read-only; held by a process that hangs
             path.parent.mkdir(parents=True, exist_ok=True)
