@@ -6,6 +6,7 @@ Adam. Row operations mirror what hosts do to theirs, moments included.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import torch
@@ -255,7 +256,9 @@ class ThresholdStore:
         else:
             parents = self._rows(parents, count, "append")
             new = self.logits.detach()[parents]
-        self._resize(lambda rows: torch.cat([rows, rows.new_zeros(count)]), tail=new)
+        self._resize(lambda rows: torch.cat([rows, rows.new_zeros(count)]))
+        with torch.no_grad():
+            self.logits[len(self) - count :] = new
 
     def rearrange(self, origins: Tensor, fresh: Tensor) -> None:
         """Keep, copy and append rows at once: row i takes the values of row ``origins[i]``.
@@ -344,17 +347,14 @@ class ThresholdStore:
             "exp_avg_sq": exp_avg_sq,
         }
 
-    def _resize(self, change: Any, tail: Tensor | None = None) -> None:
-        """Apply a row operation to logits and moments alike; tail overwrites the last logits."""
+    def _resize(self, change: Callable[[Tensor], Tensor]) -> None:
+        """Apply a row operation to logits and moments alike."""
         old, given = self.optimizer.state.get(self.logits), self._known(self._given)
         lr = self.optimizer.param_groups[0]["lr"]
-        logits = change(self.logits.detach())
-        if tail is not None and len(tail):
-            logits[-len(tail) :] = tail
-        self._bind(logits, lr)
+        self._bind(change(self.logits.detach()), lr)
         if old:
             self._set_moments(change(old["exp_avg"]), change(old["exp_avg_sq"]), old["step"])
-        if given is not None and tail is None:
+        if given is not None:
             self._given = self._note(change(given))
 
     def _rows(self, rows: Tensor, count: int, operation: str) -> Tensor:

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from core.sessions import state
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -238,7 +239,7 @@ def test_an_export_without_thresholds_leaves_none_of_an_earlier_one(tmp_path):
     path = tmp_path / "splat.ply"
     sidecar.path_beside(path).write_text("of an earlier export")
     call = SimpleNamespace(run=lambda: None, how=lambda: (path, torch.arange(2)), seam="exporter")
-    saving.on_pack(SimpleNamespace(last=None, models={}), call)
+    saving.on_pack(state(), call)
     assert not sidecar.path_beside(path).exists()
 
 
