@@ -111,21 +111,16 @@ class Settings:
             if not fits(value := getattr(self, name)):
                 where = name.replace("_", " ")
                 raise UsageError(where, repr(value)[:80], expected, "Correct it.")
+        if not self.goal.on_area:
+            return
+        model, remedy = f"a {self.goal.name} model", "Drop one of the two."
         for name in ("stop", "rim"):
-            if self.goal.on_area and getattr(self, name) not in (None, "auto"):
-                raise UsageError(
-                    "options",
-                    f"a {self.goal.name} model with a {name}",
-                    f"one of the two: viewers that ignore thresholds ignore a {name}",
-                    "Drop one of the two.",
-                )
-        if self.goal.on_area and self.train != "all":
-            raise UsageError(
-                "options",
-                f"a {self.goal.name} model with train={self.train!r}",
-                "all: only shapes that move can cover less area",
-                "Drop one of the two.",
-            )
+            if getattr(self, name) not in (None, "auto"):
+                expected = f"one of the two: viewers that ignore thresholds ignore a {name}"
+                raise UsageError("options", f"{model} with a {name}", expected, remedy)
+        if self.train != "all":
+            expected = "all: only shapes that move can cover less area"
+            raise UsageError("options", f"{model} with train={self.train!r}", expected, remedy)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, for records and ``--json``; the goal as text (``goals.parse_goal``)."""

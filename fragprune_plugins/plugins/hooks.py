@@ -59,8 +59,13 @@ def schedule_for(settings: Settings, plugins: Plugins | None = None) -> Schedule
     Raises:
         PluginError: a plugin raised, or its answer is not a schedule.
     """
+
+    def wrong(answer: Any) -> Wrong | None:
+        expected = "a schedule: a Schedule, or a subclass of it"
+        return None if isinstance(answer, Schedule) else (repr(answer), expected)
+
     hook = hookspecs.fragprune_create_schedule
-    answer = (plugins or installed()).ask(hook, _no_schedule, settings=settings)
+    answer = (plugins or installed()).ask(hook, wrong, settings=settings)
     return Schedule(settings) if answer is None else answer
 
 
@@ -113,11 +118,6 @@ def _no_engine(answer: Any) -> Wrong | None:
         getattr(answer, "name", None), str
     )
     return None if fits else (repr(answer), "an engine: a name, and rasterize(inputs, thresholds)")
-
-
-def _no_schedule(answer: Any) -> Wrong | None:
-    expected = "a schedule: a Schedule, or a subclass of it"
-    return None if isinstance(answer, Schedule) else (repr(answer), expected)
 
 
 def _no_thresholds(answer: Any, count: int, device: torch.device) -> Wrong | None:
