@@ -120,21 +120,16 @@ def check_lens(
             raise InputError(name, f"{focal:g}", expected, "Check the camera.")
     for name, centre, side in (("cx", cx, width), ("cy", cy, height)):
         if centre is not None and not abs(centre) <= FOCAL_MAX * side:
-            raise InputError(
-                name, f"{centre:g}", f"a place near {side} pixels", "Check the camera."
-            )
+            expected = f"a place near {side} pixels"
+            raise InputError(name, f"{centre:g}", expected, "Check the camera.")
 
 
 def _check_features(name: str, tensor: Tensor | None, n: int) -> None:
     """Raise InputError unless tensor is None or (n, F) with F in 1 to FEATURES_MAX."""
     check_tensor(name, tensor, n, None)
-    if tensor is not None and not 1 <= tensor.shape[1] <= FEATURES_MAX:
-        raise InputError(
-            name,
-            f"{tensor.shape[1]} channels",
-            f"1 to {FEATURES_MAX}",
-            "Blend more in several rasterizations.",
-        )
+    if tensor is not None and not 1 <= (count := tensor.shape[1]) <= FEATURES_MAX:
+        remedy = "Blend more in several rasterizations."
+        raise InputError(name, f"{count} channels", f"1 to {FEATURES_MAX}", remedy)
 
 
 def check_degree(name: str, sh: Tensor | None, degree: int, sh_rest: Tensor | None = None) -> None:

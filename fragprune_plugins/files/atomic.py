@@ -66,7 +66,7 @@ def locked(path: Path, wait: float | None = None, what: str = "lock") -> Iterato
             "one process at a time",
             "Wait for the other process, or choose another output.",
         ) from error
-    except (OSError, NotImplementedError) as error:  # the latter, from filelock before 4
+    except (OSError, NotImplementedError) as error:  # filelock's word for ENOSYS
         if getattr(error, "errno", errno.ENOSYS) not in _WITHOUT_LOCKS:
             raise
         name.unlink(missing_ok=True)

@@ -72,11 +72,11 @@ def on_view(session: SessionState, call: SeamCall) -> Any:
             expect_to_train(session, call, model)
     again = partial(draw_view, session, call.function, model, view, call.args, call.kwargs)
     measured = isinstance(session.settings.goal, Fewer)  # a kept view keeps its model alive
-    if state is not None and learns(state) and torch.is_grad_enabled():
-        state.seen[view] = None
-        if measured:
-            state.views[view] = again
     if state is not None and state.stage is not None:
+        if state.stage.plan is not None and torch.is_grad_enabled():
+            state.seen[view] = None
+            if measured:
+                state.views[view] = again
         state.stage.picture = str(getattr(call.first, "image_name", ""))
     return again()
 
@@ -114,11 +114,6 @@ def expect_adopted(session: SessionState, call: SeamCall) -> None:
             "Attach it first, or load them: session.load(model, path). To draw without, use "
             "fragprune_plugins.paused().",
         )
-
-
-def learns(state: ModelState) -> bool:
-    """Whether the model is in stage 2."""
-    return state.stage is not None and state.stage.plan is not None
 
 
 def draw_view(

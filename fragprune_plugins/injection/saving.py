@@ -166,10 +166,10 @@ def rows_of(means: Tensor, among: Tensor, where: str) -> Tensor:
     both = np.concatenate([known, wanted])
     _, first, which = np.unique(both, axis=0, return_index=True, return_inverse=True)
     rows = first[which.reshape(-1)[len(known) :]]
-    if (rows >= len(known)).any():
+    if lost := int((rows >= len(known)).sum()):
         raise AlignmentError(
             where,
-            f"{int((rows >= len(known)).sum())} of {len(wanted)} positions without a Gaussian",
+            f"{lost} of {len(wanted)} positions without a Gaussian",
             f"positions of the {len(known)} Gaussians",
             "Report this with the host's commit: it packs another model.",
         )

@@ -206,20 +206,19 @@ def load_plugins(found: Iterable[EntryPoint] | None = None) -> Plugins:
         where = f"entry point {entry.name} = {entry.value}"
         if entry.name in blocked or (only and entry.name not in only):
             plugins.findings.append(Finding("info", "plugin-blocked", where, "blocked by name"))
-        elif entry.name in plugins.loaded:
-            if entry.value != plugins.loaded[entry.name]:
-                plugins.findings.append(
-                    Finding(
-                        "warning",
-                        "plugin-shadowed",
-                        where,
-                        f"the name is taken by {plugins.loaded[entry.name]}",
-                        "one plugin per name",
-                        "Uninstall one of the two distributions.",
-                    )
-                )
-        else:
+        elif entry.name not in plugins.loaded:
             _load(plugins, entry, where)
+        elif entry.value != (first := plugins.loaded[entry.name]):
+            plugins.findings.append(
+                Finding(
+                    "warning",
+                    "plugin-shadowed",
+                    where,
+                    f"the name is taken by {first}",
+                    "one plugin per name",
+                    "Uninstall one of the two distributions.",
+                )
+            )
     return plugins
 
 
