@@ -17,7 +17,7 @@ from fragprune_plugins.constants import NEUTRAL_LOGIT
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import AlignmentError, SessionError, UsageError
 from fragprune_plugins.hosts.dialect import HostCall
-from fragprune_plugins.hosts.seams import SeamCall
+from fragprune_plugins.hosts.seams import Seam, SeamCall
 from fragprune_plugins.injection.proofs import proved
 from fragprune_plugins.injection.saving import adopt
 from fragprune_plugins.injection.state import ModelState, SessionState
