@@ -496,13 +496,13 @@ def _read_changes(fork: Fork) -> None:
                 continue
             at = fork.repo.at(_module(script), node.lineno)
             fork.warn("optimizer", at, f"stage 2 does not freeze what {name} of {script} trains")
-            if "load_state_dict" not in _mentioned(trained):
+            if f"{name}.load_state_dict(" not in ast.unparse(trained or ast.Pass()):
                 fork.one_run = fork.one_run or f"{script} does not resume what {name} trains"
 
 
 def read_getters(fork: Fork) -> list[Finding]:
     """Errors of the model's getters. They may give something else where an attribute is set that
-    is None at first, if no method that scripts reach sets it.
+    is None at first, if no method that scripts reach sets it, and nothing beside the model.
     """
     methods = _methods(fork.repo)
     reached = {name for tree in fork.trees.values() for _, name in _method_calls(tree)}
@@ -513,27 +513,17 @@ def read_getters(fork: Fork) -> list[Finding]:
         if called in methods and called not in reached
     }:
         reached |= more
+    own = (methods[name] for name in (reached & methods.keys()) - {"__init__"})
     made = {
-        _target(node)
-        for name in (reached & methods.keys()) - {"__init__"}
-        for node in nodes(methods[name])
+        each.attr
+        for tree in (*own, *fork.trees.values(), fork.repo.tree(RENDERER))
+        for node in nodes(tree)
         if isinstance(node, ast.Assign) and not is_off(node.value)
+        for each in node.targets
+        if isinstance(each, ast.Attribute)
     }
-    found = []
-    for getter, stored in (
-        ("get_xyz", ""),
-        ("get_opacity", "_opacity"),
-        ("get_scaling", "_scaling"),
-    ):
-        body = methods.get(getter)
-        asked = re.findall(r"self\.(\w+) is not None", ast.unparse(body)) if body else []
-        unset = {each for each in asked if fork.is_off(each)} - made
-        if not stored:
-            found += reading.read_getters(fork.repo, MODEL, unset)
-        elif body and not reading.activates(body, stored, unset):
-            at = fork.repo.place(MODEL, f"{CLASS}.{getter}")
-            found.append(Finding.error("model-getter", at, f"{getter} is computed", stored))
-    return found
+    unset = reading.unset(fork.repo, MODEL, CLASS) - made
+    return reading.read_getters(fork.repo, MODEL, unset)
 
 
 # -- draws -----------------------------------------------------------------------------------------

@@ -104,6 +104,7 @@ class MovingGaussians(GraphdecoAdapter):
         ParamGroup("grid", scheduled=True),
         *GraphdecoAdapter.groups[1:],
     )
+    drawn_from = ("_deformation",)
     own_names = ("save_deformation", "_deformation_table")
     dialect_type = MovingDialect
     undrawn = (

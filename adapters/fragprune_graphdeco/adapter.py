@@ -11,6 +11,7 @@ from pathlib import Path
 from types import MappingProxyType, ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from fragprune_graphdeco import plain
 from fragprune_graphdeco.call import RasterizerCall, drawing_functions, read_calls
 from fragprune_graphdeco.densifying import clones, splits
 from fragprune_graphdeco.kernels import SPLAT, Kernel, read_kernels, vendored
@@ -235,6 +236,7 @@ class GraphdecoAdapter(ScriptAdapter):
         calls: calls of the rasterizer that the dialect answers; each function makes one of them.
             The functions are those of the module that the first VIEW seam names.
         dialect_type: the dialect that answers them.
+        drawn_from: attributes of the model from which its functions draw, besides those of 3DGS.
         own_names: names that only this host's source mentions, not its ancestors': "module:name",
             or a name in the module of the model.
         scripts: paths of training scripts in the checkout, the usual one first.
@@ -254,6 +256,7 @@ class GraphdecoAdapter(ScriptAdapter):
     """How the host's rasterizer draws; the sources of a vendored one are compared with it."""
     calls: tuple[RasterizerCall, ...] = (RasterizerCall(),)
     dialect_type: type[GraphdecoDialect] = GraphdecoDialect
+    drawn_from: tuple[str, ...] = ()
     own_names: tuple[str, ...] = ()
     scripts: tuple[str, ...] = ("train.py",)
     optimizer = "Adam"
@@ -296,6 +299,17 @@ class GraphdecoAdapter(ScriptAdapter):
             *(read_flags(repo, self.command_line(repo)) if repo.tree(MODEL) else ()),
             *self._groups(repo),
             *self._calls(repo),
+            *self._drawn(repo),
+        ]
+
+    def _drawn(self, repo: HostRepo) -> list[Finding]:
+        """An error for each input of the rasterizer that is made of other values."""
+        module, accepted = self._accepted()
+        values = ", ".join(("the values of 3DGS", *self.drawn_from))
+        return [
+            Finding.error("drawn-values", f"{module}:{name}", reason, f"a drawing of {values}")
+            for name in dict.fromkeys(each.function for each in accepted)
+            for reason in plain.read_drawing(repo, module, name, self.drawn_from)
         ]
 
     def _groups(self, repo: HostRepo) -> list[Finding]:

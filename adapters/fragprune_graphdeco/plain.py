@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from weakref import WeakKeyDictionary
 
+from fragprune_graphdeco import reading
 from fragprune_graphdeco.call import RASTERIZER
 from fragprune_graphdeco.kernels import SPLAT, read_kernels
-from fragprune_graphdeco.reading import ACTIVATIONS, activates, defaults, made_models, returns
+from fragprune_graphdeco.reading import ACTIVATIONS, defaults, made_models, returns
 from fragprune_plugins.adapting import (
     Function,
     HostRepo,
@@ -40,6 +41,10 @@ _OF_CALL = re.compile(
     r"opacity|opacities|features|shs|rotations?|\w*sh\w*"
 )
 """Parameters of a drawing function that move or select Gaussians, or are their values."""
+_KEEPS = ("clamp", "clamp_", "contiguous", "squeeze", "unsqueeze", "to")
+"""Methods that keep the numbers of a picture."""
+_PICTURES = re.compile(r"mesh_\w+|\w+_(rgb|colou?rs?)")
+"""Arguments of a rasterizer that are pictures to blend with its own."""
 _SAVES = re.compile(r"\.save_ply\(|scene\w*\.save\(")
 _UNSAVED = "none of its scripts saves a PLY"
 
@@ -80,8 +85,8 @@ def _read_plain(repo: HostRepo) -> Plain:
     moving |= (getters := dict(_of_getters(repo, module, name)))
     reasons = [
         *flat,
-        *getters,
         *made,
+        *getters,
         *_of_columns(repo, module, name),
         *(() if flat else _of_kernel(repo)),
         *drawn,
@@ -222,19 +227,12 @@ def _of_getters(repo: HostRepo, module: str, name: str) -> Iterator[tuple[str, b
     saved = ast.unparse(repo.function(module, f"{name}.save_ply") or ast.Pass())
     if repo.function(module, f"{name}.get_xyz") is None:  # a class that only saves
         module, name = "scene.gaussian_model", "GaussianModel"
-    for kind in ("xyz", "opacity", "scaling", "rotation"):
-        body = repo.function(module, f"{name}.get_{kind}")
-        at = repo.place(module, f"{name}.get_{kind}")
-        stands = kind == "xyz" and "self.get_xyz" in saved
-        if body is not None and not stands and not activates(body, f"_{kind}"):
-            asked = re.findall(r"self\.(\w+) is not None", ast.unparse(body))
-            first = {each: list(defaults(repo, module, each)) for each in asked}
-            unset = {each for each, values in first.items() if values and all(map(is_off, values))}
-            yield f"get_{kind} is computed ({at})", activates(body, f"_{kind}", unset)
-    for node in nodes(repo.function(module, f"{name}.get_features")):
-        called = ast.unparse(node.func) if isinstance(node, ast.Call) else "torch.cat"
-        if isinstance(node, ast.BinOp) or called != "torch.cat":
-            yield f"get_features is computed ({repo.place(module, f'{name}.get_features')})", False
+    off = reading.unset(repo, module, name)
+    always = reading.computed_getters(repo, module, name, off)
+    for kind in reading.computed_getters(repo, module, name):
+        if kind != "xyz" or "self.get_xyz" not in saved:
+            at = repo.place(module, f"{name}.get_{kind}")
+            yield f"get_{kind} is computed ({at})", kind not in always
 
 
 def _of_positions(repo: HostRepo, module: str, name: str) -> Iterator[str]:
@@ -367,6 +365,12 @@ def _call(function: Function) -> ast.Call | None:
     return min(calls, key=lambda each: each.lineno, default=None)
 
 
+def _draws(call: ast.Call) -> bool:
+    """Whether a call draws, or makes settings for that."""
+    names = {each.arg for each in call.keywords}
+    return "means3D" in names or "viewmatrix" in names
+
+
 def read_selection(repo: HostRepo, module: str, function: str) -> str:
     """The code that picks rows of what a function draws, as ``means3D[mask]``; "" without any."""
     body = repo.function(module, function)
@@ -380,11 +384,23 @@ def read_cut(repo: HostRepo, module: str, function: str) -> str:
     return next(map(ast.unparse, cuts), "")
 
 
+def read_drawing(
+    repo: HostRepo, module: str, function: str, drawn_from: Collection[str]
+) -> Iterator[str]:
+    """What a function draws besides values of plain 3DGS and of these attributes of the model."""
+    body = repo.function(module, function)
+    drawing = _Drawing(repo, module, body, drawn_from) if body is not None else None
+    yield from (each for each, _ in drawing.inputs()) if drawing else ()
+
+
 class _Drawing:
     """A drawing function: where the inputs of its rasterizer come from."""
 
-    def __init__(self, repo: HostRepo, module: str, function: Function) -> None:
+    def __init__(
+        self, repo: HostRepo, module: str, function: Function, drawn_from: Collection[str] = ()
+    ) -> None:
         self.repo, self.module, self.function = repo, module, function
+        self.drawn_from = drawn_from
         arguments = function.args
         every = [*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs]
         self.parameters, self.off = {each.arg for each in every}, off_by_default(function)
@@ -500,14 +516,45 @@ class _Drawing:
         return ""
 
     def reasons(self) -> Iterator[tuple[str, bool]]:
-        """Inputs of the first call that a plain drawing does not have, and whether arguments of
-        the function make them from the model's own.
-        """
-        call = _call(self.function)
+        """Why the picture is not that of the PLY, and whether its rows are drawn all the same."""
         cuts = list(self.cuts())
         if cuts and not any(re.search(r"\[0?:3[,\]]", ast.unparse(each)) for each in cuts):
             cut = self.repo.at(self.module, cuts[0].lineno)
             yield f"its picture is cut out of a tensor with further channels ({cut})", False
+        yield from self.inputs()
+        calls = (each for each in nodes(self.function) if isinstance(each, ast.Call))
+        names = (k.arg for each in calls if _draws(each) for k in each.keywords)
+        if pictures := [each for each in names if each and _PICTURES.fullmatch(each)]:
+            yield f"its rasterizer also takes {', '.join(dict.fromkeys(pictures))}", False
+        for node in nodes(self.function):
+            pairs = zip(node.keys, node.values, strict=True) if isinstance(node, ast.Dict) else ()
+            for key, value in pairs:
+                made = self._made_into(value) if getattr(key, "value", "") == "render" else None
+                if made is not None:
+                    at = self.repo.at(self.module, made.lineno)
+                    yield f"its picture is made into {ast.unparse(made)[:60]} ({at})", True
+
+    def _made_into(self, value: ast.expr, seen: tuple[str, ...] = ()) -> ast.expr | None:
+        """The code that makes something else of the picture than its clamped numbers."""
+        whole = value
+        while isinstance(value, ast.Call) and value is not self.call and not _draws(value):
+            method = value.func
+            if not isinstance(method, ast.Attribute) or method.attr not in _KEEPS:
+                return whole
+            value = value.args[0] if ast.unparse(method.value) == "torch" else method.value
+        if isinstance(value, ast.BinOp):
+            behind = isinstance(value.op, ast.Add) and "bg_color" in ast.unparse(value.right)
+            return self._made_into(value.left, seen) if behind else whole
+        name = getattr(value, "id", "")
+        others = self.values.get(name, []) if name not in seen else []
+        made = (self._made_into(each, (*seen, name)) for each in others)
+        return next((each for each in made if each is not None), None)
+
+    def inputs(self) -> Iterator[tuple[str, bool]]:
+        """Inputs of the first call that a plain drawing does not have, and whether arguments of
+        the function make them from the model's own.
+        """
+        call = self.call
         given = {each.arg: each.value for each in call.keywords if each.arg} if call else {}
         at = self.repo.at(self.module, self.function.lineno)
         for argument in ("means3D", "opacities", "scales", "rotations"):
@@ -583,5 +630,5 @@ class _Drawing:
     def _plain(self, root: str) -> bool:
         _, dot, attribute = root.partition(".")
         if dot:
-            return bool(_OF_MODEL.fullmatch(attribute))
+            return attribute in self.drawn_from or bool(_OF_MODEL.fullmatch(attribute))
         return root in self.switches or (root != self.model and bool(_OF_CALL.fullmatch(root)))

@@ -6,10 +6,18 @@ import ast
 import re
 from collections.abc import Collection, Iterator
 
-from fragprune_plugins.adapting import CommandLine, Finding, Function, HostRepo, imported, nodes
+from fragprune_plugins.adapting import (
+    CommandLine,
+    Finding,
+    Function,
+    HostRepo,
+    imported,
+    is_off,
+    nodes,
+)
 
-GETTERS = ("get_xyz", "get_opacity")
-"""Properties of the model that every adapter of this family reads."""
+GETTERS = ("xyz", "opacity", "scaling", "rotation")
+"""Values of a model that its properties give, by the names of their parameters."""
 _SHAPES = {"repeat", "expand", "view", "reshape", "squeeze", "unsqueeze", "contiguous"}
 """Methods that change how often or in what shape a value stands, not the value."""
 _FUNCTIONAL = ("torch.nn.functional", "nn.functional", "F")
@@ -19,35 +27,62 @@ ACTIVATIONS = {
     "rotation_activation": tuple(f"{each}.normalize" for each in _FUNCTIONAL),
 }
 """What activates each kind of value of a plain model."""
+_ASKED = re.compile(r"self\.(\w+) is not None")
 _OTHER_FLAGS = ("hydra", "omegaconf", "tyro", "jsonargparse", "fire", "gin", "click", "absl")
 
 
-def read_getters(
-    repo: HostRepo, module: str, unset: Collection[str] = (), model: str = "GaussianModel"
-) -> list[Finding]:
-    """An error for each getter that is no property, and for computed positions.
+def read_getters(repo: HostRepo, module: str, unset: Collection[str] = ()) -> list[Finding]:
+    """An error for each getter that is no property, or that gives other than its parameter.
 
-    A threshold belongs to a row of the positions that the optimizer moves. Attributes in ``unset``
-    are None.
+    A threshold belongs to a row of the parameters. Attributes in ``unset`` are None.
     """
-    found = []
-    for name in GETTERS if repo.tree(module) else ():  # if not, the seams say so
-        function, hint = repo.function(module, f"{model}.{name}"), ""
-        itself = " that returns self._xyz, the parameter itself" if name == "get_xyz" else ""
-        if function is None:
-            what = "no such property"
-        elif not is_property(function):
-            what = "a method"
-        elif itself and returns(function, "_xyz", unset) != {"stored"}:
+    found, computed = [], computed_getters(repo, module, "GaussianModel", unset)
+    for kind in GETTERS if repo.tree(module) else ():  # if not, the seams say so
+        name = f"GaussianModel.get_{kind}"
+        function, read = repo.function(module, name), kind in ("xyz", "opacity")
+        if kind in computed:
             made = [each.value for each in nodes(function) if isinstance(each, ast.Return)]
             ends = " or ".join(ast.unparse(each) for each in made if each)
-            what = f"computed, it returns {ends[:60] or 'nothing'}"
-            hint = "Thresholds follow the rows of the parameter, which these are not."
+            what = f"get_{kind} is computed, it returns {ends[:60] or 'nothing'}"
+        elif read and not (function and is_property(function)):
+            what = "a method" if function else "no such property"
         else:
             continue
-        at = f"{module}:{model}.{name} ({repo.place(module, f'{model}.{name}')})"
-        found.append(Finding.error("model-getter", at, what, f"a property{itself}", hint))
+        at = f"{module}:{name} ({repo.place(module, name)})"
+        expected = f"a property of the rows of self._{kind}, activated if they are no positions"
+        found.append(Finding.error("model-getter", at, what, expected))
     return found
+
+
+def computed_getters(
+    repo: HostRepo, module: str, model: str, unset: Collection[str] = ()
+) -> list[str]:
+    """The kinds of values, and "features", whose getter gives other than its parameters.
+
+    What getters do where attributes in ``unset`` are not None does not count.
+    """
+    getters = {
+        each: repo.function(module, f"{model}.get_{each}") for each in (*GETTERS, "features")
+    }
+    features = [
+        node
+        for node in nodes(getters.pop("features"))
+        if isinstance(node, ast.BinOp)
+        or (isinstance(node, ast.Call) and ast.unparse(node.func) != "torch.cat")
+    ]
+    wanted = {kind: {"stored" if kind == "xyz" else "activated"} for kind in GETTERS}
+    return [
+        *(k for k, each in getters.items() if each and returns(each, f"_{k}", unset) != wanted[k]),
+        *(["features"] if features else []),
+    ]
+
+
+def unset(repo: HostRepo, module: str, model: str) -> set[str]:
+    """Attributes that getters of a model ask for, and that are None at first."""
+    getters = (repo.function(module, f"{model}.get_{kind}") for kind in GETTERS)
+    texts = " ".join(ast.unparse(each) for each in getters if each)
+    asked = {each: list(defaults(repo, module, each)) for each in _ASKED.findall(texts)}
+    return {each for each, values in asked.items() if values and all(map(is_off, values))}
 
 
 def made_models(repo: HostRepo, module: str) -> list[str]:
@@ -83,15 +118,6 @@ def is_property(function: Function) -> bool:
     return any("property" in ast.unparse(each) for each in function.decorator_list)
 
 
-def activates(getter: Function, stored: str, unset: Collection[str] = ()) -> bool:
-    """Whether a getter returns rows of an attribute, activated if they are no positions.
-
-    What it does where attributes in ``unset`` are not None does not count.
-    """
-    wanted = "activated" if f"{stored[1:]}_activation" in ACTIVATIONS else "stored"
-    return returns(getter, stored, unset) == {wanted}
-
-
 def returns(getter: Function, stored: str, unset: Collection[str] = ()) -> set[str]:
     """What a getter returns: "stored" and "activated" rows of an attribute, or "computed" values.
 
@@ -112,30 +138,22 @@ def returns(getter: Function, stored: str, unset: Collection[str] = ()) -> set[s
             return known.get(value.id, "computed")
         return "stored" if value and ast.unparse(value) == f"self.{stored}" else "computed"
 
-    skipped = without(getter, unset)
-    for statement in getter.body:
-        for node in (each for each in nodes(statement) if id(each) not in skipped):
-            if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
-                name, made = node.targets[0].id, state(node.value)
-                if node is not statement and name in known:  # in one branch of several
-                    rows = rf"self\.{stored}_?\w*|{name}\[\w+\]"
-                    chosen = made == known[name] or re.fullmatch(rows, ast.unparse(node.value))
-                    made = known[name] if chosen else "computed"
-                known[name] = made
-    body = [node for node in nodes(getter) if id(node) not in skipped]
-    return {state(node.value) for node in body if isinstance(node, ast.Return)}
-
-
-def without(function: Function, unset: Collection[str]) -> set[int]:
-    """The ids of the nodes that are reached only where attributes in ``unset`` are not None."""
     off = {f"self.{each} is not None" for each in unset}
-    return {
+    skipped = {
         id(inner)
-        for node in nodes(function)
+        for node in nodes(getter)
         if isinstance(node, ast.If) and ast.unparse(node.test) in off
         for each in node.body
         for inner in nodes(each)
     }
+    for statement in getter.body:
+        for node in (each for each in nodes(statement) if id(each) not in skipped):
+            if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+                name, made = node.targets[0].id, state(node.value)
+                branch = node is not statement and name in known  # one of several
+                known[name] = "computed" if branch and made != known[name] else made
+    body = [node for node in nodes(getter) if id(node) not in skipped]
+    return {state(node.value) for node in body if isinstance(node, ast.Return)}
 
 
 def training_scripts(repo: HostRepo, *patterns: str) -> tuple[str, ...]:

@@ -81,6 +81,7 @@ class LP3DGS(GraphdecoAdapter):
     """The adapter of LP-3DGS."""
 
     name = "lp-3dgs"
+    drawn_from = ("get_opacity_and_scales_for_train",)
     descends_from = ("vanilla-3dgs",)
     info = HostInfo(
         "LP-3DGS",

@@ -73,6 +73,7 @@ class MipSplatting(GraphdecoAdapter):
         ),
     )
     calls = (RasterizerCall(frozenset({"kernel_size", "subpixel_offset"})),)
+    drawn_from = ("get_opacity_with_3D_filter", "get_scaling_with_3D_filter")
     own_names = ("compute_3D_filter", "get_opacity_with_3D_filter", "filter_3D")
     dialect_type = MipDialect
     filtered = True

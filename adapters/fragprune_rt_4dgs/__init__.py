@@ -55,6 +55,10 @@ class RT4DGS(GraphdecoAdapter):
         ParamGroup("scaling_t"),
         ParamGroup("rotation_r"),
     )
+    drawn_from = (
+        *("get_current_covariance_and_mean_offset", "get_marginal_t"),
+        *("active_sh_degree_t", "get_t", "time_duration"),
+    )
     own_names = ("get_marginal_t", f"{RASTERIZER}:GaussianRasterizer")
     dialect_type = RT4DGSDialect
     flags = {

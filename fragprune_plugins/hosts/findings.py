@@ -71,7 +71,7 @@ class Plain:
         reasons: what speaks against it, the weightiest first.
         model: class of the model; "" if there is none that saves a PLY.
         moved: those of the reasons that only say that the drawing function gets how to move the
-            model's own Gaussians, of which it still draws each one.
+            model's own Gaussians, of which it still draws each, or what it makes of the picture.
         folder: of the codebase in the checkout; "" for the checkout itself.
         elsewhere: where the model is, as text, if it is not where such codebases have it.
     """

@@ -289,6 +289,22 @@ def test_values_may_be_others_where_no_script_sets_them(tmp_path, value, called)
     assert ("computed" in str(errors(repo))) == called
 
 
+@pytest.mark.parametrize("name", ["gaussian_renderer/__init__.py", "train.py"])
+def test_values_are_others_where_something_beside_the_model_sets_them(tmp_path, name):
+    returned = "        return self._xyz\n"
+    repo = fork(
+        tmp_path,
+        (returned, GETTER.format(returned)),
+        ("sh_degree): ...", "sh_degree):\n        self._new = None"),
+    )
+    assert errors(repo) == []
+    path, told = tmp_path / name, {"train.py": "gaussians"}.get(name, "pc")
+    text = path.read_text()
+    at = text.index("    rasterizer = ") if told == "pc" else text.index("    for iteration in")
+    path.write_text(f"{text[:at]}    {told}._new = made\n{text[at:]}")
+    assert "computed" in str(errors(HostRepo(tmp_path)))
+
+
 NOT_RESUMED = {
     "no restore": ("gaussians.restore(", "gaussians.load("),
     "no capture": ("def capture(", "def other("),
@@ -305,6 +321,11 @@ NOT_RESUMED = {
     "a network beside": (
         "gaussians.training_setup(opt)",
         "gaussians.training_setup(opt)\n    optim = torch.optim.Adam(net.parameters())",
+    ),
+    "a network of other weights": (
+        "gaussians.training_setup(opt)",
+        "gaussians.training_setup(opt)\n    net.load_state_dict(weights)\n"
+        "    optim = torch.optim.Adam(net.parameters())",
     ),
     "a lost network": ('"params": [self.poses]', '"params": self.net.parameters()'),
     "a whole network": ('"params": [self.poses]', '"params": self.poses.parameters()'),

@@ -64,6 +64,17 @@ def render(viewpoint_camera, pc, pipe, bg_color, training=False, override_color=
         means3D=means3D, opacities=opacity, shs=shs, scales=scales, rotations=rotations
     )
 """
+MEAN = """rotations=rotations
+    )
+    return {"render": image.mean(dim=0)}
+"""
+CLAMPED = """rotations=rotations
+    )
+    if training:
+        image = image * pc.exposure
+    image = torch.clamp(image, 0, 1) + (1 - alpha) * bg_color
+    return {"render": image.contiguous()}
+"""
 
 
 @pytest.fixture
@@ -162,6 +173,16 @@ def test_the_nearest_host_is_of_this_family(fork):
             "made = self._scaling\n        if on: made = net(made)\n        return torch.exp(made)",
             "get_scaling is computed",
         ),
+        *(
+            (
+                "return self.scaling_activation(self._scaling)",
+                f"made = self._scaling\n        if on: made = {k}\n        return torch.exp(made)",
+                "get_scaling is computed",
+            )
+            for k in ("made[seen]", "self._scaling_quantised")
+        ),
+        ("rotations=rotations\n    )\n", MEAN, "its picture is made into image.mean(dim=0)"),
+        ("shs=shs, scales", "mesh_color=mesh, shs=shs, scales", "rasterizer also takes mesh_color"),
         ("{'params': [], 'name': 'f_dc'}", "{'params': [self._opacity]}", "not train positions"),
         ("shs=shs, scales", "colors_precomp=torch.exp(rgb), shs=shs, scales", "torch.exp(rgb)"),
         ("shs=shs, scales", "colors_precomp=pc.net(view), shs=shs, scales", "colours from pc.net"),
@@ -187,10 +208,6 @@ def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):
         ("shs = pc.get_features", "shs = cut(pc.get_features, pc.get_max_sh_channels)"),
         ("opacity = pc.get_opacity\n", "opacity = pc.opacity_activation(pc._opacity)\n"),
         ("activation(self._scaling)", "activation(self._scaling.repeat(1, 3))"),
-        (
-            "return self.scaling_activation(self._scaling)",
-            "made = self._scaling\n        if on: made = made[at]\n        return torch.exp(made)",
-        ),
         ("shs = pc.get_features", "shs = pc.get_features(training)"),
         ("    means3D = pc.get_xyz\n", "    means3D = pc.net(t)\n    means3D = pc.get_xyz\n"),
         (
@@ -198,6 +215,7 @@ def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):
             "rotations=rotations\n    )\n    opacity = pc.net(image)\n",
         ),
         ("rotations=rotations\n    )\n", "rotations=rotations\n    )\n    image = image[:3]\n"),
+        ("rotations=rotations\n    )\n", CLAMPED),
         (".repeat(1, 3)", "\n        scales = scales if self.round else scales.repeat(1, 3)"),
     ],
 )

@@ -251,3 +251,25 @@ def test_a_folder_of_the_same_name_as_an_installed_host_is_not_that_host(tmp_pat
     with pytest.raises(UnknownHostError):
         locate(HostRepo(checkout), [Installed()], above=False)
     assert looked_at == ["sharedname"]
+
+
+def test_a_drawing_of_other_values_than_the_adapter_states_is_refused(tmp_path):
+    root = tmp_path / "posed"
+    posed = rewritten(
+        skeleton(root), "gaussian_renderer/__init__.py", "means3D=1", "means3D=pc.posed(pc.get_xyz)"
+    )
+    assert "[drawn-values]" in "".join(errors(posed))
+    assert "render makes means3D from pc.posed, not from its PLY alone" in errors(posed)[0]
+    stated = type("Posed", (Vanilla3DGS,), {"drawn_from": ("posed",)})
+    assert not errors(posed, stated)
+
+
+@pytest.mark.parametrize("kind", ["scaling", "rotation"])
+def test_every_value_that_a_named_host_draws_is_its_parameter_activated(tmp_path, kind):
+    repo = skeleton(tmp_path, **{"other": ""})
+    getter = f"    @property\n    def get_{kind}(self): return %s\n\n    def other"
+    activated = f"self.{kind}_activation(self._{kind})"
+    path = "scene/gaussian_model.py"
+    assert not errors(rewritten(repo, path, "    def other", getter % activated))
+    moved = rewritten(repo, path, f"return {activated}", f"return {activated} * self.spread")
+    assert f"get_{kind} is computed" in errors(moved)[0]
