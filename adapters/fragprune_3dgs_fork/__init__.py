@@ -257,7 +257,7 @@ class ForkAdapter(GraphdecoAdapter):
         fork = read_fork(repo)
         served = replace(self.command_line(repo), scripts=fork.scripts)
         return [
-            *self.other_host(repo, reading.renamed(repo)),
+            *self.other_host(repo, [*reading.renamed(repo), *reading.compiled(repo, fork.scripts)]),
             *fork.findings,
             *read_getters(fork),
             *(reading.read_flags(repo, served) if fork.scripts else ()),

@@ -543,6 +543,7 @@ def _read_draws(fork: Fork) -> None:
         named = more
     for name in reached:
         body = fork.repo.function(RENDERER, name)
+        assert body is not None  # it draws
         parameters = fork.repo.parameters(RENDERER, name) or ()
         model = next((each for each in _MODEL_ARGUMENTS if each in parameters), "")
         at = f"{RENDERER}:{name} ({fork.repo.place(RENDERER, name)})"
@@ -558,21 +559,20 @@ def _read_draws(fork: Fork) -> None:
             fork.refuse("rasterizer-call", at, "a result that is not unpacked", "its values")
             continue
         fork.draws += (Draw(name, camera, model, calls),)
+        source = plain.Drawing(fork.repo, RENDERER, body)
         for call in calls:
             _check_call(fork, at, name, call)
-        if cut := plain.read_cut(fork.repo, RENDERER, name):
-            fork.refuse("rasterizer-call", at, f"a picture of more channels, {cut}", "a picture")
-        if selected := plain.read_selection(fork.repo, RENDERER, name):
+            blended = call.given.get(fork.blended.get(call.package, ""))
+            made = source.values.get(getattr(blended, "id", ""), [])
+            if any(re.search(r"torch\.(zeros|empty)\(", ast.unparse(each)) for each in made):
+                found = f"{ast.unparse(blended or ast.Pass())}, which is empty unless asked for"
+                fork.refuse("rasterizer-call", at, found, "channels of every Gaussian")
+        for cut in [*source.cuts()][:1]:
+            found = f"a picture of more channels, {ast.unparse(cut)}"
+            fork.refuse("rasterizer-call", at, found, "a picture")
+        if selected := source.selection():
             fork.refuse("rasterizer-call", at, f"draws a selection, {selected}", "all rows")
-        fork.colours |= {
-            node.test.attr
-            for node in nodes(body)
-            if isinstance(node, ast.If)
-            and isinstance(node.test, ast.Attribute)
-            and node.test.attr not in ("convert_SHs_python", "compute_cov3D_python")
-            and fork.is_off(node.test.attr)
-            and any(ast.unparse(each).startswith("colors_precomp = ") for each in node.body)
-        }
+        fork.colours |= source.colours
     if not fork.draws and not any(each.code == "rasterizer-call" for each in fork.findings):
         at = f"{RENDERER} ({fork.repo.place(RENDERER, 'render')})"
         fork.refuse("rasterizer-call", at, "no drawing function that a script calls", "render")

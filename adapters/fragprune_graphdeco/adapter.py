@@ -16,6 +16,7 @@ from fragprune_graphdeco.call import RasterizerCall, drawing_functions, read_cal
 from fragprune_graphdeco.densifying import clones, splits
 from fragprune_graphdeco.kernels import SPLAT, Kernel, read_kernels, vendored
 from fragprune_graphdeco.reading import (
+    compiled,
     defaults,
     made_models,
     read_flags,
@@ -286,9 +287,10 @@ class GraphdecoAdapter(ScriptAdapter):
         for module, _, name in (each.rpartition(":") for each in self.own_names):
             module = module or MODEL
             missing += [] if repo.mentions([module], [name]) else [f"no {name} in {module}"]
+        missing += [*renamed(repo), *compiled(repo, self.scripts_of(repo))]
         packages = dict.fromkeys([self.package, *(each.package for each in self.calls)])
         return [
-            *self.other_host(repo, [*missing, *renamed(repo)]),
+            *self.other_host(repo, missing),
             *(
                 finding
                 for package in packages
@@ -309,7 +311,8 @@ class GraphdecoAdapter(ScriptAdapter):
         return [
             Finding.error("drawn-values", f"{module}:{name}", reason, f"a drawing of {values}")
             for name in dict.fromkeys(each.function for each in accepted)
-            for reason in plain.read_drawing(repo, module, name, self.drawn_from)
+            if (body := repo.function(module, name))
+            for reason, _ in plain.Drawing(repo, module, body, self.drawn_from).inputs()
         ]
 
     def _groups(self, repo: HostRepo) -> list[Finding]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from weakref import WeakKeyDictionary
 
 from fragprune_graphdeco import reading
-from fragprune_graphdeco.call import RASTERIZER
+from fragprune_graphdeco.call import RASTERIZER, read_calls
 from fragprune_graphdeco.kernels import SPLAT, read_kernels
 from fragprune_graphdeco.reading import ACTIVATIONS, defaults, made_models, returns
 from fragprune_plugins.adapting import (
@@ -181,8 +181,9 @@ def _scales(repo: HostRepo, module: str, name: str) -> Iterator[str]:
     stored = [each for each in assigned if ast.unparse(each.targets[0]) == "self._scaling"]
     names = {node.id for each in stored for node in nodes(each.value) if isinstance(node, ast.Name)}
     made = [each for each in assigned if getattr(each.targets[0], "id", "") in names]
-    for each in assigned:
-        if ast.unparse(each.value).endswith(".repeat(1, 2)"):
+    for each in (node for node in nodes(repo.tree(module)) if isinstance(node, ast.Assign)):
+        flat = ast.unparse(each.value).endswith(".repeat(1, 2)")
+        if flat and (each in assigned or "scal" in ast.unparse(each.targets[0])):
             yield f"its Gaussians are flat, with two scales ({repo.at(module, each.lineno)})"
             return
     if made and all(ast.unparse(each.value).endswith("[..., None]") for each in made):
@@ -343,7 +344,7 @@ def _of_drawing(repo: HostRepo) -> Iterator[tuple[str, bool]]:
         others = [each for each in functions[1:] if each.name.startswith("render")]
         instead = [each for each in others if each.name in named and "render" not in named]
         for function in [*functions[:1], *instead[:1]]:
-            yield from _Drawing(repo, module, function).reasons()
+            yield from Drawing(repo, module, function).reasons()
         if functions:
             return
 
@@ -355,7 +356,7 @@ def _drawing(repo: HostRepo, module: str) -> list[ast.FunctionDef]:
     return sorted(found, key=lambda each: each.name != "render")
 
 
-def _call(function: Function) -> ast.Call | None:
+def _call(function: ast.AST) -> ast.Call | None:
     """The first call that draws."""
     calls = [
         node
@@ -365,36 +366,15 @@ def _call(function: Function) -> ast.Call | None:
     return min(calls, key=lambda each: each.lineno, default=None)
 
 
-def _draws(call: ast.Call) -> bool:
-    """Whether a call draws, or makes settings for that."""
-    names = {each.arg for each in call.keywords}
-    return "means3D" in names or "viewmatrix" in names
+class Drawing:
+    """A drawing function: where the inputs of its rasterizer come from.
 
+    Args:
+        drawn_from: attributes of the model that it may draw besides those of plain 3DGS.
 
-def read_selection(repo: HostRepo, module: str, function: str) -> str:
-    """The code that picks rows of what a function draws, as ``means3D[mask]``; "" without any."""
-    body = repo.function(module, function)
-    return _Drawing(repo, module, body).selection() if body is not None else ""
-
-
-def read_cut(repo: HostRepo, module: str, function: str) -> str:
-    """The code that takes a function's picture out of further channels, as ``image[:3]``; or ""."""
-    body = repo.function(module, function)
-    cuts = _Drawing(repo, module, body).cuts() if body is not None else iter(())
-    return next(map(ast.unparse, cuts), "")
-
-
-def read_drawing(
-    repo: HostRepo, module: str, function: str, drawn_from: Collection[str]
-) -> Iterator[str]:
-    """What a function draws besides values of plain 3DGS and of these attributes of the model."""
-    body = repo.function(module, function)
-    drawing = _Drawing(repo, module, body, drawn_from) if body is not None else None
-    yield from (each for each, _ in drawing.inputs()) if drawing else ()
-
-
-class _Drawing:
-    """A drawing function: where the inputs of its rasterizer come from."""
+    Attributes:
+        colours: options, off by default, under which something else makes the colours.
+    """
 
     def __init__(
         self, repo: HostRepo, module: str, function: Function, drawn_from: Collection[str] = ()
@@ -418,6 +398,7 @@ class _Drawing:
         ]
         self.model = models[0] if models else "pc"
         self.call = _call(function)
+        self.colours = set[str]()
         named = (*self.parameters, self.model)
         self.made: dict[str, tuple[str, ...]] = {each: (each,) for each in named}
         self.drawn = self.made
@@ -464,8 +445,9 @@ class _Drawing:
         if option in ("", "convert_SHs_python"):
             return False
         values = list(defaults(self.repo, "arguments", option))
-        colours = any(ast.unparse(each).startswith("colors_precomp = ") for each in node.body)
-        return colours and bool(values) and all(map(is_off, values))
+        made = any(ast.unparse(each).startswith("colors_precomp = ") for each in node.body)
+        self.colours |= {option} if made and values and all(map(is_off, values)) else set()
+        return option in self.colours
 
     def _assign(self, target: ast.expr, value: ast.expr) -> None:
         if isinstance(target, ast.Tuple):
@@ -500,8 +482,8 @@ class _Drawing:
                     yield from self._roots(part)
 
     def selection(self) -> str:
-        """The code that picks some of the model's rows, however they come to the first call."""
-        call, own, seen = _call(self.function), f"{self.model}.get_xyz", set()
+        """The code that picks rows of what is drawn first, as ``means3D[mask]``; "" without any."""
+        call, own, seen = self.call, f"{self.model}.get_xyz", set()
         waiting = [each.value for each in call.keywords if each.arg == "means3D"] if call else []
         while waiting:
             for node in ast.walk(waiting.pop()):
@@ -522,10 +504,11 @@ class _Drawing:
             cut = self.repo.at(self.module, cuts[0].lineno)
             yield f"its picture is cut out of a tensor with further channels ({cut})", False
         yield from self.inputs()
-        calls = (each for each in nodes(self.function) if isinstance(each, ast.Call))
-        names = (k.arg for each in calls if _draws(each) for k in each.keywords)
-        if pictures := [each for each in names if each and _PICTURES.fullmatch(each)]:
-            yield f"its rasterizer also takes {', '.join(dict.fromkeys(pictures))}", False
+        calls = read_calls(self.repo, self.module, self.function.name)
+        own = [each.arg for each in self.call.keywords if each.arg] if self.call else []
+        names = dict.fromkeys([*own, *(name for each in calls for name in each.given)])
+        if pictures := [each for each in names if _PICTURES.fullmatch(each)]:
+            yield f"its rasterizer also takes {', '.join(pictures)}", False
         for node in nodes(self.function):
             pairs = zip(node.keys, node.values, strict=True) if isinstance(node, ast.Dict) else ()
             for key, value in pairs:
@@ -537,7 +520,7 @@ class _Drawing:
     def _made_into(self, value: ast.expr, seen: tuple[str, ...] = ()) -> ast.expr | None:
         """The code that makes something else of the picture than its clamped numbers."""
         whole = value
-        while isinstance(value, ast.Call) and value is not self.call and not _draws(value):
+        while isinstance(value, ast.Call) and _call(value) is None:
             method = value.func
             if not isinstance(method, ast.Attribute) or method.attr not in _KEEPS:
                 return whole
@@ -605,11 +588,10 @@ class _Drawing:
 
     def cuts(self) -> Iterator[ast.expr]:
         """What takes channels out of the picture that the rasterizer returns."""
-        call = _call(self.function)
         whole = {
             getattr(target.elts[0] if isinstance(target, ast.Tuple) else target, "id", "")
             for node in nodes(self.function)
-            if isinstance(node, ast.Assign) and node.value is call
+            if isinstance(node, ast.Assign) and node.value is self.call
             for target in node.targets
         } - {""}
         for node in nodes(self.function):

@@ -108,6 +108,18 @@ def renamed(repo: HostRepo) -> list[str]:
     ][:1]
 
 
+def compiled(repo: HostRepo, scripts: Collection[str]) -> list[str]:
+    """Functions that scripts compile, and that go backward: no seam is reached in them."""
+    return [
+        f"{script} compiles {node.name}, which trains"
+        for script in scripts
+        for node in nodes(repo.tree(script.removesuffix(".py").replace("/", ".")))
+        if isinstance(node, ast.FunctionDef)
+        and any("torch.compile" in ast.unparse(each) for each in node.decorator_list)
+        and any(getattr(each, "attr", "") == "backward" for each in nodes(node))
+    ]
+
+
 def _there(repo: HostRepo, name: str) -> bool:
     """Whether a checkout has a module or a folder of this name."""
     return repo.path(name) is not None or (repo.root / name).is_dir()

@@ -88,6 +88,10 @@ def test_blended_channels_are_known_by_argument_and_kernel(tmp_path, name):
     assert errors(fork(tmp_path / "unknown", used, **given))
     lit = OBJECTS.replace("= O[ch]", "= O[ch] + T * bg[ch]")
     assert errors(fork(tmp_path / "lit", used, **given, kernel=lit))
+    made = "    objects = pc.get_objects if pipe.seen else torch.zeros((1,))\n    rasterizer ="
+    passed = {"values": values, "arguments": f", {name}=objects", "kernel": OBJECTS}
+    empty = fork(tmp_path / "empty", used, ("    rasterizer =", made), **passed)
+    assert "objects, which is empty unless asked for" in errors(empty)[0]
 
 
 DRAWN = "if (test_T < 0.0001f) { done = true; continue; }"

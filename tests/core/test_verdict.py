@@ -64,6 +64,11 @@ def render(viewpoint_camera, pc, pipe, bg_color, training=False, override_color=
         means3D=means3D, opacities=opacity, shs=shs, scales=scales, rotations=rotations
     )
 """
+GROWS = """
+    def grow(self, points):
+        scales = scales.repeat(1, 2)
+
+    def save_ply"""
 MEAN = """rotations=rotations
     )
     return {"render": image.mean(dim=0)}
@@ -149,6 +154,7 @@ def test_the_nearest_host_is_of_this_family(fork):
         ('names.append("f_dc_{}".format(i))', "...", "lacks the columns f_dc"),
         (".repeat(1, 3)", ".repeat(1, 2)", "flat, with two scales"),
         (".repeat(1, 3)", "", "its Gaussians are round, with one scale"),
+        ("    def save_ply", GROWS, "flat, with two scales"),
         ("= self._opacity.detach()", "= self.get_opacity.detach()", "stores activated values"),
         ("scaling_activation = torch.exp", "scaling_activation = softplus", "is softplus"),
         (
@@ -397,3 +403,16 @@ def test_another_kernel_makes_another_picture_of_the_same_ply(fork, tmp_path):
     verdict = judged(HostRepo(tmp_path))
     assert verdict.kind == "never"
     assert "no exp()" in verdict.reason
+
+
+def test_a_script_that_compiles_its_training_fits_nothing(tmp_path):
+    skeleton(tmp_path)
+    script = tmp_path / "train.py"
+    step = "\n\n%sdef step(loss):\n    loss.backward()\n"
+    text = script.read_text()
+    script.write_text(text + step % "")
+    assert judged(HostRepo(tmp_path)).kind == "fits"
+    script.write_text(text + step % "@torch.compile\n")
+    verdict = judged(HostRepo(tmp_path))
+    assert verdict.kind == "never"
+    assert "train.py compiles step, which trains" in str(verdict.differs)
