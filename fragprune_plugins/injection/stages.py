@@ -8,6 +8,7 @@ for more iterations, and thresholds learn.
 from __future__ import annotations
 
 import contextlib
+import gc
 import logging
 import sys
 import time
@@ -124,8 +125,9 @@ class Stages:
             if (saved := end()) is None:
                 raise
             log.warning(
-                "the host had saved %s when it failed, and stage 2 goes on: %s", saved, error
+                "the host had saved %s when it failed, and stage 2 goes on: %s", saved, str(error)
             )
+        gc.collect()  # the error held the host's frames, and so its socket and its model
         if (saved := end()) is None:  # some hosts refuse a command with exit code 0
             raise HostFailed(
                 self.host.script.name,

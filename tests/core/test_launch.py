@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import socket
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -375,9 +376,14 @@ if not args.start_checkpoint:
 """
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # its socket
 def test_a_training_whose_evaluation_fails_goes_on_to_stage_two(host, tmp_path, caplog):
     out = tmp_path / "out"
-    run([host(STAGES + FAILS_AFTERWARDS), "-m", str(out)], AUTO)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    host(f"import socket\nopen = socket.create_server(('127.0.0.1', {port}))", "network_gui.py")
+    run([host(f"import network_gui\n{STAGES}{FAILS_AFTERWARDS}"), "-m", str(out)], AUTO)
     checkpoint = out / "chkpnt12345.pth"
     assert (out / "log").read_text().splitlines()[1] == f"17346 [] {checkpoint}"
     (said,) = (each.message for each in caplog.records if "ours_30000" in each.message)
