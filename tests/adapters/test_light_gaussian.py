@@ -133,14 +133,6 @@ def test_training_resumes_itself_and_pruning_stands_still(trained):
     assert np.load(out / "imp_score.npz")["arr_0"].shape == (summary.gaussians,)
 
 
-def survivors(before, after):
-    """Which row of one PLY each row of another is, by its position."""
-    one, other = read_ply(before).xyz, read_ply(after).xyz
-    rows = (other[:, None] == one[None]).all(dim=2).int()
-    assert (rows.sum(dim=1) == 1).all()
-    return rows.argmax(dim=1)
-
-
 @pytest.mark.parametrize("given", ["checkpoint", "point cloud"])
 def test_pruning_is_stage_one_of_its_own_script(mini, photographs, trained, tmp_path, given):
     summary, out = trained

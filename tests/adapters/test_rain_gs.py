@@ -17,7 +17,6 @@ from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
-from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.run.work import measure_models, photographs_of
 from fragprune_rain_gs import PACKAGE, RainGS
@@ -101,17 +100,6 @@ def test_every_mode_is_fine_tuned_and_moves_opacities_and_thresholds_alone(
         photographs_of(summary), EngineOptions()
     )  # though no --eval is in the command
     assert {PACKAGE, "wandb"} & set(sys.modules) == set()
-
-
-class Steps:
-    """Keeps what every learned step reports."""
-
-    def __init__(self):
-        self.steps = []
-
-    @hookimpl
-    def fragprune_step(self, stats):
-        self.steps.append(stats.step)
 
 
 @pytest.mark.parametrize("mode", ["--ours", "--ours_new"])
