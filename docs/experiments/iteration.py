@@ -176,7 +176,8 @@ def time_losses(size: str) -> dict[str, float]:
     image.requires_grad_()
     builds = {name: binding.open_build(name) for name in reversed(binding.usable_builds())}
     codes = {"torch": losses.torch_loss} | {
-        name: partial(compiled_loss, library=library) for name, library in builds.items()
+        name: partial(compiled_loss, ssim_weight=losses.SSIM_WEIGHT, library=library)
+        for name, library in builds.items()
     }
     found = {}
     for name, code in codes.items():
