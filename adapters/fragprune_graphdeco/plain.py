@@ -181,7 +181,10 @@ def _scales(repo: HostRepo, module: str, name: str) -> Iterator[str]:
     stored = [each for each in assigned if ast.unparse(each.targets[0]) == "self._scaling"]
     names = {node.id for each in stored for node in nodes(each.value) if isinstance(node, ast.Name)}
     made = [each for each in assigned if getattr(each.targets[0], "id", "") in names]
-    for each in (node for node in nodes(repo.tree(module)) if isinstance(node, ast.Assign)):
+    own = [
+        each for each in getattr(repo.tree(module), "body", ()) if getattr(each, "name", "") == name
+    ]
+    for each in (node for model in own for node in nodes(model) if isinstance(node, ast.Assign)):
         flat = ast.unparse(each.value).endswith(".repeat(1, 2)")
         if flat and (each in assigned or "scal" in ast.unparse(each.targets[0])):
             yield f"its Gaussians are flat, with two scales ({repo.at(module, each.lineno)})"

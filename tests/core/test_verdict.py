@@ -222,6 +222,10 @@ def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):
         ),
         ("rotations=rotations\n    )\n", "rotations=rotations\n    )\n    image = image[:3]\n"),
         ("rotations=rotations\n    )\n", CLAMPED),
+        (
+            "class GaussianModel:",
+            f"class GaussianModel2D:{GROWS}(self): ...\n\n\nclass GaussianModel:",
+        ),
         (".repeat(1, 3)", "\n        scales = scales if self.round else scales.repeat(1, 3)"),
     ],
 )
