@@ -93,7 +93,10 @@ class Compact3DGS(GraphdecoAdapter):
         "Draw and measure with the host's render.py and metrics.py.",
     )
     densifies_until = ()  # it prunes by its mask to the end
-    drawn_from = ("_mask", "mlp_head", "recolor", "contract_to_unisphere", "direction_encoding")
+    drawn_from = (
+        *("_mask", "_feature", "mlp_head", "recolor"),
+        *("contract_to_unisphere", "direction_encoding"),
+    )
     own_names = ("vq_scale", "recolor", "mlp_head")
     seams = (
         *revised(GraphdecoAdapter.seams, {"GaussianModel.load_ply": None}),

@@ -198,20 +198,6 @@ class Added:
     def precompute(self):
         self._feature = self.recolor(self._xyz.detach())
 
-    def seen_from(self, camera, itr, rvq_iter):
-        """Scales, rotations, opacities and colours; stored values once training is over."""
-        away = nn.functional.normalize(self._xyz - camera.camera_center)  # noqa: F821
-        if itr == -1:
-            colours = self.mlp_head(self._feature, away)
-            return self._scaling, self._rotation, self._opacity, colours
-        sure = torch.sigmoid(self._mask)
-        mask = ((sure > 0.01).float() - sure).detach() + sure
-        scales, rotations = self.get_scaling, self.get_rotation
-        if rvq_iter:
-            scales, rotations = self.vq_scale(scales)[0], self.vq_rot(rotations)[0]
-        colours = self.mlp_head(self.recolor(self._xyz.detach()), away)
-        return scales * mask, rotations, self.get_opacity * mask, colours
-
     def construct_list_of_attributes(self):
         scales, rotations = (f"scale_{i}" for i in range(3)), (f"rot_{i}" for i in range(4))
         return ["x", "y", "z", "nx", "ny", "nz", "opacity", *scales, *rotations]
@@ -275,6 +261,19 @@ def after_densification(iteration, opt, gaussians):
         gaussians.mask_prune()
 
 
+LOOK = """    away = torch.nn.functional.normalize(pc.get_xyz - viewpoint_camera.camera_center)
+    if itr == -1:  # stored values once training is over
+        scales, rotations, opacity = pc._scaling, pc._rotation, pc._opacity
+        colours = pc.mlp_head(pc._feature, away)
+    else:
+        sure = torch.sigmoid(pc._mask)
+        mask = ((sure > 0.01).float() - sure).detach() + sure
+        scales, rotations = pc.get_scaling, pc.get_rotation
+        if rvq_iter:
+            scales, rotations = pc.vq_scale(scales)[0], pc.vq_rot(rotations)[0]
+        scales, opacity = scales * mask, pc.get_opacity * mask
+        colours = pc.mlp_head(pc.recolor(pc.get_xyz.detach()), away)
+"""
 LOOKS = (  # of the demo's render: what gives way to the model's own
     '    shape = {"scales": None, "rotations": None, "cov3D_precomp": None}\n',
     "    image, radii = GaussianRasterizer(",
@@ -368,9 +367,7 @@ class CompactHost(Descendant):
         renderer = root / RENDERER
         text = renderer.read_text()
         begin, end = (text.index(passage) for passage in LOOKS)
-        taken = "pc.seen_from(viewpoint_camera, itr, rvq_iter)"
-        own = f"    scales, rotations, opacity, colours = {taken}\n"
-        renderer.write_text(text[:begin] + own + text[end:])
+        renderer.write_text(text[:begin] + LOOK + text[end:])
 
     def new_model(self, degree: int) -> Any:
         from argparse import ArgumentParser
