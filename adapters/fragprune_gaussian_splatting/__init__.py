@@ -151,6 +151,7 @@ class GaussianSplatting(GraphdecoAdapter):
     installed = (PACKAGE, MCMC, REDUCED)
     package = RASTERIZER
     calls = (RasterizerCall(frozenset({"antialiasing"}), 3),)
+    drawn_from = ("colors_precomp",)  # nobody gives it
     scripts = (f"{PACKAGE}/train.py",)
     dialect_type = PackageDialect
     seams = (

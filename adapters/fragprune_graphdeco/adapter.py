@@ -237,7 +237,8 @@ class GraphdecoAdapter(ScriptAdapter):
         calls: calls of the rasterizer that the dialect answers; each function makes one of them.
             The functions are those of the module that the first VIEW seam names.
         dialect_type: the dialect that answers them.
-        drawn_from: attributes of the model from which its functions draw, besides those of 3DGS.
+        drawn_from: attributes of the model, and arguments, from which its functions draw, besides
+            those of 3DGS.
         own_names: names that only this host's source mentions, not its ancestors': "module:name",
             or a name in the module of the model.
         scripts: paths of training scripts in the checkout, the usual one first.

@@ -373,7 +373,8 @@ class Drawing:
     """A drawing function: where the inputs of its rasterizer come from.
 
     Args:
-        drawn_from: attributes of the model that it may draw besides those of plain 3DGS.
+        drawn_from: attributes of the model, and arguments, that it may draw besides those of
+            plain 3DGS.
 
     Attributes:
         colours: options, off by default, under which something else makes the colours.
@@ -614,6 +615,8 @@ class Drawing:
 
     def _plain(self, root: str) -> bool:
         _, dot, attribute = root.partition(".")
+        if (attribute or root) in self.drawn_from:
+            return True
         if dot:
-            return attribute in self.drawn_from or bool(_OF_MODEL.fullmatch(attribute))
+            return bool(_OF_MODEL.fullmatch(attribute))
         return root in self.switches or (root != self.model and bool(_OF_CALL.fullmatch(root)))

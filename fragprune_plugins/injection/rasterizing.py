@@ -17,7 +17,7 @@ from fragprune_plugins.constants import NEUTRAL_LOGIT
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import AlignmentError, SessionError, UsageError
 from fragprune_plugins.hosts.dialect import HostCall
-from fragprune_plugins.hosts.seams import Seam, SeamCall
+from fragprune_plugins.hosts.seams import SeamCall
 from fragprune_plugins.injection.proofs import proved
 from fragprune_plugins.injection.saving import adopt
 from fragprune_plugins.injection.state import ModelState, SessionState
@@ -32,7 +32,6 @@ from fragprune_plugins.plugins.hooks import thresholds_for
 from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 log = logging.getLogger("fragprune")
-_unproved: set[Seam] = set()  # rasterizers of which that was said: a run has several sessions
 
 
 class _AddToLoss(torch.autograd.Function):
@@ -215,8 +214,8 @@ def proved_answer(
     stands_in = session.stand_ins.answers(call.seam.module)
     if prover is None or stands_in:
         why = "a stand-in of ours draws here" if stands_in else "its calls have another form"
-        if call.seam not in _unproved:
-            _unproved.add(call.seam)
+        if call.seam not in session.unproved:
+            session.unproved.add(call.seam)
             log.info("%s: nothing is proved, because %s", call.seam.module, why)
         return session.dialect.answer
     strict = ours or session.learn or not session.proofs

@@ -27,6 +27,7 @@ from fragprune_plugins.errors import (
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.hosts.adapter import ScriptAdapter
 from fragprune_plugins.hosts.photographs import Photographs
+from fragprune_plugins.hosts.seams import Seam
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import process, starting, workers
 from fragprune_plugins.injection.command import HostCommand
@@ -58,6 +59,7 @@ class Stages:
     after: Path | None = None
     learned: Summary | None = None
     curves: list[dict[str, float]] = field(default_factory=list)
+    unproved: set[Seam] = field(default_factory=set)  # rasterizers of which that was said
     already_finished: bool = False
 
     def __post_init__(self) -> None:
@@ -269,6 +271,7 @@ class Stages:
             origin=self.around if self.start or options.get("start") else None,
             **options,
         )
+        session.unproved = self.unproved
         known, host = set(sys.modules), self.host
         folder = Path.cwd() if host.module else host.script.parent
         try:

@@ -131,6 +131,7 @@ class SessionState:
         self.trained = trained_groups(adapter.groups, self.settings.train)  # names; None for all
         self.unpacked: tuple[Tensor, ThresholdStore] | None = None  # waits for its model
         self.similar: bool | None = None  # compiled similarity agrees with the host's own
+        self.unproved: set[Seam] = set()  # rasterizers of which that was said
         self.absent: set[Seam] = set()  # metrics whose weights cannot be loaded
         self.models: weakref.WeakKeyDictionary[Any, ModelState] = weakref.WeakKeyDictionary()
         self.optimizers: weakref.WeakKeyDictionary[Any, list[weakref.ReferenceType[Any]]] = (

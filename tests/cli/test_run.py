@@ -1,6 +1,7 @@
 """fragprune run, on a small host: what is said of its result, and how it is compared."""
 
 import json
+import logging
 import shutil
 
 import pytest
@@ -57,8 +58,10 @@ def folder(trained, tmp_path):
     return shutil.copytree(out, tmp_path / "out"), scene
 
 
-def test_the_line_has_frame_times_and_says_that_no_control_was_run(scene, tmp_path):
+def test_the_line_has_frame_times_and_says_that_no_control_was_run(scene, tmp_path, caplog):
+    caplog.set_level(logging.INFO, logger="fragprune")
     result = run("run", *WORDS, *command(scene, tmp_path / "out"))
+    assert caplog.text.count("nothing is proved") == 1  # not once in each stage
     assert result.exit_code == 0, result.stderr
     (line,) = (line for line in result.stdout.splitlines() if "x fewer fragments" in line)
     assert " ms (" in line

@@ -14,7 +14,7 @@ from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.cuda import comparison
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import FragpruneError
-from fragprune_plugins.types import RasterInputs, Splats
+from fragprune_plugins.types import RasterInputs, Splats, one_line
 from fragprune_plugins.workbench.bench.scene import make_scene, make_view
 
 TRUNCATION = 16 / 255
@@ -48,6 +48,7 @@ class Scene:
     name: str
     inputs: RasterInputs
     thresholds: Tensor | None
+    __repr__ = one_line
 
 
 @cache
