@@ -8,15 +8,17 @@ from __future__ import annotations
 
 import hashlib
 import os
-from contextlib import ExitStack, suppress
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
+from filelock import FileLock, Timeout
+
 from fragprune_plugins import native
-from fragprune_plugins.errors import OutputError
-from fragprune_plugins.files.atomic import locked, replacing
 
 ENVIRONMENT: Final = "FRAGPRUNE_CUDA"
 """Set to off, it switches the cuda engine off."""
@@ -218,16 +220,27 @@ def image_of(
     what = repr((by.name, by.version, _OPTIONS, source, sorted(macros.items()), target))
     digest = hashlib.sha256(digest_of_sources() + what.encode()).hexdigest()[:24]
     path = cache_folder() / f"{source}-{target}-{digest}.bin"
-    with ExitStack() as alone:
-        with suppress(OSError, OutputError):  # read-only; held by a process that hangs
-            path.parent.mkdir(parents=True, exist_ok=True)
-            alone.enter_context(locked(path, wait=300, what="compiling"))
+    with _one_at_a_time(path):
         if (kept := _read(path)) is not None:
             return kept, True
         image = by.compile(source, macros, target)
-        with suppress(OutputError), replacing(path) as new:  # read-only, or full
-            _write(new, image)
+        with suppress(OSError):  # read-only, or full
+            _write(path, image)
         return image, False
+
+
+@contextmanager
+def _one_at_a_time(path: Path) -> Iterator[None]:
+    """Wait for other processes that write the file, if files can be locked.
+
+    Without locks two processes may write the same file in turn. Neither reads a partial file.
+    """
+    with ExitStack() as held:
+        # read-only; held by a process that hangs; file systems without locks
+        with suppress(OSError, Timeout, NotImplementedError):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            held.enter_context(FileLock(f"{path}.lock", timeout=300))
+        yield
 
 
 def _read(path: Path) -> Image | None:
@@ -243,6 +256,9 @@ def _read(path: Path) -> Image | None:
 
 
 def _write(path: Path, image: Image) -> None:
+    """Write an image to the cache; readers see all of it or nothing."""
     log = image.log.encode()
     rest = log + image.code
-    path.write_bytes(f"{hashlib.sha256(rest).hexdigest()}\n{len(log)}\n".encode() + rest)
+    with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
+        file.write(f"{hashlib.sha256(rest).hexdigest()}\n{len(log)}\n".encode() + rest)
+    os.replace(file.name, path)
