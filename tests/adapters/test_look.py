@@ -100,7 +100,8 @@ def test_a_stage_two_that_a_look_changed_is_finished_when_asked_again(trained):
 
 def test_nobody_looks_before_other_rules_of_drawing(photographs, tmp_path):
     script, look = runs.written(HOSTS["mip-splatting"], tmp_path / "host") / "train.py", Looked()
-    run(runs.command(script, photographs, tmp_path / "out", 10), replace(OPTIONS, look=look))
+    words = runs.command(script, photographs, tmp_path / "out", 10, *ENDED)
+    run(words, replace(OPTIONS, look=look))
     assert look.seen == []
 
 
