@@ -19,6 +19,7 @@ from fragprune_plugins.injection import launch
 from fragprune_plugins.learning.schedule import USUAL_STOP
 from fragprune_plugins.testing import mutations
 from fragprune_plugins.workbench.finetune import trial
+from fragprune_plugins.workbench.run import looking
 
 WORDS = ["--device", "cpu", "--iters", 6]
 
@@ -213,15 +214,20 @@ def test_a_model_that_knows_its_photographs_by_heart_is_told_and_learns_otherwis
     assert (asked["gaussians"], asked["keep"], asked["forgotten"]) == (whole, None, None)
 
 
-def test_where_nothing_can_be_tried_stage_two_learns_as_asked(scene, tmp_path, monkeypatch, caplog):
+@pytest.mark.parametrize("where", [(trial, "forgotten"), (looking, "removal_error")])
+def test_where_a_look_fails_stage_two_learns_as_asked(scene, tmp_path, monkeypatch, caplog, where):
     def fail(*_, **__):
         raise ModelFileError("out", "a stand-in", "something else", "Nothing.")
 
-    monkeypatch.setattr(trial, "forgotten", fail)
+    monkeypatch.setattr(trial, "forgotten", lambda *_, **__: trial.BY_HEART)
+    monkeypatch.setattr(*where, fail)
     result = run("run", *WORDS, *command(scene, tmp_path / "out", "--densify_until_iter", 8))
     assert result.exit_code == 0, result.stderr
     assert "not tried whether it knows its photographs by heart, because of" in caplog.text
     assert "Removed" not in result.stdout
+    (record,) = records.find(tmp_path / "out")
+    assert (record.data["keep"], record.data["forgotten"]) == (None, None)
+    assert record.data["settings"]["dropout"] is None
 
 
 @pytest.mark.parametrize(("size", "read"), [("16", (16, 12)), ("-1", (40, 30))])

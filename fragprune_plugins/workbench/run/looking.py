@@ -44,9 +44,9 @@ class Looking:
     def _look(self, ply: Path, photographs: Photographs, settings: Settings) -> Found:
         engine, device = open_engine(self.engine)
         model, dataset = load(ply, device=device), load_photographs(photographs).to(device)
-        self.trial = trial = tried(model, dataset, settings, engine=engine, say=log.info)
-        if not isinstance(trial.keep, float):
-            return Found(trial.settings)
-        views = views_near(dataset.train, seed=settings.seed)
-        scores = removal_error(model, model.falloff, views, engine)
-        return Found(trial.settings, best(scores, trial.keep).cpu())
+        trial, kept = tried(model, dataset, settings, engine=engine, say=log.info), None
+        if isinstance(trial.keep, float):
+            views = views_near(dataset.train, seed=settings.seed)
+            kept = best(removal_error(model, model.falloff, views, engine), trial.keep).cpu()
+        self.trial = trial
+        return Found(trial.settings, kept)
