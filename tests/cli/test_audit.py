@@ -116,6 +116,14 @@ def test_given_cameras_need_no_photographs(model, tmp_path):
     assert {view["width"] for view in report["maps"]["views"]} == {tiny.SIDE}
 
 
+def test_the_command_that_it_advises_takes_the_photographs_that_it_was_given(model, tmp_path):
+    data = tiny.write_blender(tmp_path / "data", tiny.photographs(tiny.random_model()))
+    given = run_json("audit", model, "--data", data, "--views", 1)["pruning"]
+    alone = run_json("audit", model, "--orbit", "--views", 1, "--resolution", 16)["pruning"]
+    assert f"fragprune finetune {model} --data {data} --out pruned.ply." in given
+    assert f"fragprune finetune {model} --self --out pruned.ply. No photographs" in alone
+
+
 def test_the_cameras_of_its_training_are_taken_unless_others_are_asked_for(model, tmp_path):
     path = tmp_path / "run" / "point_cloud" / "iteration_5" / "point_cloud.ply"
     path.parent.mkdir(parents=True)

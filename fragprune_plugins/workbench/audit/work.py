@@ -56,6 +56,7 @@ def audit(
     measurements, shown = measured(loaded, named, engine=rasterizer, progress=True)
     figures: dict[str, Any] = {
         "model": str(model),
+        "data": None if data is None else str(data),
         "cameras": {
             "kind": placed.side,
             "why": placed.why,

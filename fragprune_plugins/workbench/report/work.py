@@ -215,7 +215,7 @@ def _settings(record: Record) -> list[list[str]]:
     facts = {key: record.data.get(key) for key in keys} | record.data.get("settings", {})
     facts |= {key: record.data.get(key) for key in ("model", "model_before", "model_after", "out")}
     return [
-        [key, f"{value:.4g}" if isinstance(value, float) else str(value)]
+        [key.replace("_", " "), f"{value:.4g}" if isinstance(value, float) else str(value)]
         for key, value in facts.items()
         if value is not None
     ]
