@@ -71,27 +71,3 @@ def describe_written(out: Path, held: str = "", *, pruned: bool = True) -> str:
     cut = f", and cutoffs {form.thresholds}" if pruned and form.thresholds else ""
     kept = f" A {form.suffix} file keeps {form.keeps}{cut}." if form.keeps else ""
     return f"Wrote {out}{held}.{kept}"
-
-
-def dropping(out: Path, bytes_before: int, before: int, after: int) -> dict[str, int]:
-    """Counts of dropped Gaussians and bytes, for --json.
-
-    Args:
-        bytes_before: size of the file with all Gaussians.
-        before: number of all Gaussians.
-        after: number of Gaussians left.
-    """
-    return {
-        "gaussians": before - after,
-        "of": before,
-        "bytes_before": bytes_before,
-        "bytes_after": out.stat().st_size,
-    }
-
-
-def describe_dropped(dropped: dict[str, int], why: str) -> str:
-    """The counts of ``dropping`` as a line of text; ``why`` describes the dropped Gaussians."""
-    return (
-        f"Dropped {dropped['gaussians']:,} of {dropped['of']:,} Gaussians, {why}: "
-        f"{dropped['bytes_before']:,} -> {dropped['bytes_after']:,} bytes."
-    )

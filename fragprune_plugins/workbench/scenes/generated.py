@@ -78,11 +78,8 @@ def around(
     centre, radius = bounds(splat)
     views = []
     for number in range(count):
-        rise, turn = 1 - (2 * number + 1) / count, number * _GOLDEN_ANGLE
-        level = math.sqrt(1 - rise * rise)
-        away = torch.tensor([level * math.cos(turn), rise, level * math.sin(turn)])
         far = radius / math.sin(math.radians(_FOV) / 2) * stream.uniform(*_NEARER)
-        eye = centre + far * away
+        eye = centre + far * _direction(number, count)
         view = look_at(eye, centre, width=pixels, height=pixels, fov_y=_FOV, background=background)
         views.append((f"around{number:03d}", view))
     return views
@@ -97,13 +94,18 @@ def within(places: Sequence[Tensor], count: int, *, pixels: int = 800) -> Named:
     """
     views = []
     for number in range(count):
-        rise, turn = _LEVEL * (1 - (2 * number + 1) / count), number * _GOLDEN_ANGLE
-        level = math.sqrt(1 - rise * rise)
-        ahead = torch.tensor([level * math.cos(turn), rise, level * math.sin(turn)])
         eye = places[number % len(places)].detach().float().cpu()
-        view = look_at(eye, eye + ahead, width=pixels, height=pixels, fov_y=_WIDE)
+        ahead = eye + _direction(number, count, _LEVEL)
+        view = look_at(eye, ahead, width=pixels, height=pixels, fov_y=_WIDE)
         views.append((f"within{number:03d}", view))
     return views
+
+
+def _direction(number: int, count: int, steepest: float = 1.0) -> Tensor:
+    """(3,) one of many directions that are evenly spread over a sphere, or the middle of it."""
+    rise, turn = steepest * (1 - (2 * number + 1) / count), number * _GOLDEN_ANGLE
+    level = math.sqrt(1 - rise * rise)
+    return torch.tensor([level * math.cos(turn), rise, level * math.sin(turn)])
 
 
 def between(cameras: Named, *, seed: int = 0) -> Named:
@@ -191,12 +193,18 @@ def interpolate(a: View, b: View, t: float) -> View:
     view = torch.eye(4, dtype=torch.float64)
     view[:3, :3] = rotation.T
     view[3, :3] = -rotation @ centre
-    lens = torch.linalg.solve(one, a.projmatrix.double().cpu())  # camera to clip
+    return moved(a, view, centre)
+
+
+def moved(view: View, viewmatrix: Tensor, campos: Tensor) -> View:
+    """The view with its lens and picture, from where another pose is."""
+    lens = torch.linalg.solve(view.viewmatrix.double(), view.projmatrix.double())  # camera to clip
+    matrix = viewmatrix.to(lens)
     return replace(
-        a,
-        viewmatrix=view.to(a.viewmatrix),
-        projmatrix=(view @ lens).to(a.projmatrix),
-        campos=centre.to(a.campos),
+        view,
+        viewmatrix=matrix.to(view.viewmatrix),
+        projmatrix=(matrix @ lens).to(view.projmatrix),
+        campos=campos.to(view.campos),
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import weakref
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -19,10 +18,6 @@ ROOM = 4096 * MEBIBYTE
 class Slot:
     """The place of one photograph's pixels, shared by its copies on other devices."""
 
-    def __init__(self) -> None:
-        self.pixels: Tensor | None = None
-        self.used = 0
-
 
 class Pictures:
     """Pixels in slots; those that were not used for longest go when the room is full.
@@ -33,36 +28,27 @@ class Pictures:
 
     def __init__(self, room: int) -> None:
         self.room = room
-        self._filled: weakref.WeakSet[Slot] = weakref.WeakSet()
-        self._clock = itertools.count(1)
+        self._held: weakref.WeakKeyDictionary[Slot, Tensor] = weakref.WeakKeyDictionary()
 
     @property
     def size(self) -> int:
         """Bytes of all pixels that are kept."""
-        return sum(_bytes(slot) for slot in self._filled)
+        return sum(pixels.numel() for pixels in self._held.values())
 
     def get(self, slot: Slot, load: Callable[[], Tensor]) -> Tensor:
         """The slot's pixels, loaded if they are not there."""
-        slot.used = next(self._clock)
-        pixels = slot.pixels
-        if pixels is None:
-            pixels = slot.pixels = load()
-            self._filled.add(slot)
-            self._make_room(slot)
+        known = self._held.pop(slot, None)
+        self._held[slot] = pixels = load() if known is None else known  # the last one in the order
+        if known is None:
+            self._make_room()
         return pixels
 
-    def _make_room(self, newest: Slot) -> None:
+    def _make_room(self) -> None:
         size = self.size
-        for slot in sorted(self._filled, key=lambda each: each.used):
-            if size <= self.room or slot is newest:
-                return
-            size -= _bytes(slot)
-            slot.pixels = None
-            self._filled.discard(slot)
-
-
-def _bytes(slot: Slot) -> int:
-    return 0 if slot.pixels is None else slot.pixels.numel()
+        *others, _ = list(self._held)
+        for slot in others:
+            if size > self.room:
+                size -= self._held.pop(slot).numel()
 
 
 PICTURES = Pictures(ROOM)
