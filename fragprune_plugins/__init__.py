@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from fragprune_plugins.workbench.figures.viewing import overview as overview
     from fragprune_plugins.workbench.figures.viewing import render_view as render_view
     from fragprune_plugins.workbench.finetune.api import finetune as finetune
-    from fragprune_plugins.workbench.finetune.result import FinetuneResult as FinetuneResult
+    from fragprune_plugins.workbench.finetune.loop import FinetuneResult as FinetuneResult
     from fragprune_plugins.workbench.goals import AtMost as AtMost
     from fragprune_plugins.workbench.goals import Faster as Faster
     from fragprune_plugins.workbench.models.model import load as load
@@ -73,7 +73,7 @@ _NAMES = {
     "workbench.figures.evaluate": "measure",
     "workbench.figures.viewing": "overview render_view",
     "workbench.finetune.api": "finetune",
-    "workbench.finetune.result": "FinetuneResult",
+    "workbench.finetune.loop": "FinetuneResult",
     "workbench.goals": "AtMost Faster",
     "workbench.models.model": "load save",
     "workbench.pruning.scores": "keep_best keep_needed",

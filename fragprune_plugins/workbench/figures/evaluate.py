@@ -27,6 +27,8 @@ from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 
 REPEATS = 9
 
+_COUNTED = ("fragments_per_pixel", "evaluated_per_pixel", "entries_per_pixel")
+
 SILENT = 2.0
 """Seconds of measuring before a bar shows how far it is."""
 
@@ -126,36 +128,24 @@ def measure_all(
     drawn = [candidate.model.splats() for candidate in candidates]
     reports: list[dict[str, Any]] = []
     for candidate, splats in zip(candidates, drawn, strict=True):
-        rows, distances = [], []
+        rows: list[dict[str, float | None]] = []
         for shot in bar(shots, "measuring"):
-            outputs = candidate.draw(engine, shot.view, splats)
+            outputs, picture = candidate.draw(engine, shot.view, splats), shot.image
             seen = shot.looked_at(outputs.image)
-            distances.append(lpips(seen, shot.image))
             rows.append(
-                (
-                    psnr(seen, shot.image),
-                    ssim(seen, shot.image),
-                    float(outputs.fragments_per_pixel),
-                    float(outputs.evaluated_per_pixel),
-                    float(outputs.entries_per_pixel),
-                    covered_per_pixel(engine, candidate.inputs(shot.view, splats)),
-                )
+                {
+                    "psnr": psnr(seen, picture),
+                    "ssim": ssim(seen, picture),
+                    "lpips": lpips(seen, picture),
+                    **{name: float(getattr(outputs, name)) for name in _COUNTED},
+                    "area_per_pixel": covered_per_pixel(
+                        engine, candidate.inputs(shot.view, splats)
+                    ),
+                }
             )
-        means = map(statistics.fmean, zip(*rows, strict=True))
-        quality, likeness, fragments, evaluated, entries, area = means
-        reports.append(
-            {
-                "target": shots[0].target,
-                "psnr": quality,
-                "ssim": likeness,
-                "lpips": _mean(distances),
-                "fragments_per_pixel": fragments,
-                "evaluated_per_pixel": evaluated,
-                "entries_per_pixel": entries,
-                "area_per_pixel": area,
-                "gaussians": candidate.gaussians or len(splats),
-            }
-        )
+        means = {name: _mean([row[name] for row in rows]) for name in rows[0]}
+        count = candidate.gaussians or len(splats)
+        reports.append({"target": shots[0].target, **means, "gaussians": count})
 
     views = [
         replace(view, width=enlarge * view.width, height=enlarge * view.height)
@@ -165,6 +155,20 @@ def measure_all(
     for report, frame in zip(reports, frames, strict=True):
         report |= frame | {"engine": engine.name, "device": str(device), "views": len(shots)}
     return reports
+
+
+@torch.no_grad()
+def psnrs(
+    candidate: Candidate, shots: Sequence[Shot], engine: Engine
+) -> tuple[list[float], list[float]]:
+    """PSNR of each view, dB, and the fragments per pixel of each."""
+    splats, figures, fragments = candidate.model.splats(), [], []
+    for shot in shots:
+        shot = shot.to(splats.device)
+        outputs = candidate.draw(engine, shot.view, splats)
+        figures.append(psnr(shot.looked_at(outputs.image), shot.image))
+        fragments.append(float(outputs.fragments_per_pixel))
+    return figures, fragments
 
 
 def bar(items: Sequence[Made], what: str) -> Iterable[Made]:

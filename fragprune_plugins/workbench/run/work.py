@@ -12,7 +12,6 @@ import click
 
 from fragprune_plugins.errors import FragpruneError
 from fragprune_plugins.files import records
-from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.injection import launch
 from fragprune_plugins.injection.process import current_gpu
 from fragprune_plugins.learning.schedule import Settings
@@ -21,6 +20,7 @@ from fragprune_plugins.workbench.commands.logs import Bar, logging_steps
 from fragprune_plugins.workbench.commands.opening import bound_threads, open_engine
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
+from fragprune_plugins.workbench.figures.recorded import Recorded
 from fragprune_plugins.workbench.figures.wording import (
     IS_CONTROL,
     begun,
@@ -88,7 +88,8 @@ def run(
                 not_compared = error
     data = _figures(summary, settings, looking.trial, before, after, not_compared)
     if summary.steps and summary.model_after:
-        more = {"curves": summary.curves, "photographs": photographs}
+        read = photographs and photographs.as_dict()
+        more = {"curves": summary.curves, "photographs": read}
         records.leave(summary.model_after, "run", data | more)
     return Report(data, _describe(summary, data, not_compared))
 
@@ -142,23 +143,18 @@ def _text(path: Path | None) -> str | None:
     return None if path is None else str(path)
 
 
-def photographs_of(summary: launch.RunSummary) -> dict[str, Any] | None:
-    """The record's "photographs": how to read the host's data and draw its models.
+def photographs_of(summary: launch.RunSummary) -> Recorded | None:
+    """How to read the host's data and draw its models; None if they cannot be measured.
 
-    None if the models cannot be measured. Joint learning leaves one model.
+    Joint learning leaves one model.
     """
-    left = [path for path in (summary.model_before, summary.model_after) if path]
     if not summary.photographs:
         return None
-    return {
-        **summary.photographs.as_dict(),
-        "models": [str(path.resolve()) for path in left],
-        "filtered": True,
-        "drawing": summary.drawing,
-    }
+    left = tuple(path for path in (summary.model_before, summary.model_after) if path)
+    return Recorded(summary.photographs, left, filtered=True, drawing=summary.drawing)
 
 
-def measure_models(photographs: dict[str, Any], engine: EngineOptions) -> list[dict[str, Any]]:
+def measure_models(read: Recorded, engine: EngineOptions) -> list[dict[str, Any]]:
     """Measure the models on held-out views, on the host's device if an engine can draw there.
 
     Returns:
@@ -166,9 +162,9 @@ def measure_models(photographs: dict[str, Any], engine: EngineOptions) -> list[d
     """
     device = "cpu" if engine.device == "cpu" else "auto"
     rasterizer, where = open_engine(EngineOptions(engine.name, device))
-    dataset = load_photographs(Photographs.from_dict(photographs))
-    models = [load(path, filtered=True, device=where) for path in photographs["models"]]
-    candidates = [Candidate(model, photographs["drawing"]) for model in models]
+    dataset = load_photographs(read.photographs)
+    models = [load(path, filtered=read.filtered, device=where) for path in read.models]
+    candidates = [Candidate(model, read.drawing) for model in models]
     return measure_all(candidates, dataset.test, engine=rasterizer)
 
 
