@@ -11,8 +11,7 @@ import pytest
 from cli.commands import run_json
 
 from fragprune_plugins.workbench.demo import folder
-from fragprune_plugins.workbench.demo.page import BANNER
-from fragprune_plugins.workbench.demo.work import DemoSettings, host_command
+from fragprune_plugins.workbench.demo.work import BANNER, DemoSettings, host_command
 from fragprune_plugins.workbench.figures.wording import outcome
 
 TINY = """

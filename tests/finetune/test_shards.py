@@ -18,8 +18,13 @@ from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.stage2 import Stage2
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs, Splats
-from fragprune_plugins.workbench.distributed.processes import Shards, part_of, whole_of
-from fragprune_plugins.workbench.distributed.sharded import ShardedEngine, reaching
+from fragprune_plugins.workbench.distributed import (
+    ShardedEngine,
+    Shards,
+    part_of,
+    reaching,
+    whole_of,
+)
 from fragprune_plugins.workbench.finetune.api import finetune
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
 from fragprune_plugins.workbench.ranks import Ranks

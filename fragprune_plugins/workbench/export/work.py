@@ -15,7 +15,7 @@ from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.models import formats
 from fragprune_plugins.workbench.models.model import load, save
 from fragprune_plugins.workbench.models.written import describe_written, require_place
-from fragprune_plugins.workbench.pruning.visibility import visible
+from fragprune_plugins.workbench.pruning import visible
 
 
 def export(

@@ -17,8 +17,7 @@ from fragprune_plugins.learning.interruption import sigterm_interrupts
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import OwnCameras, open_engine, photographs_for
 from fragprune_plugins.workbench.commands.options import require_several
-from fragprune_plugins.workbench.distributed.processes import part_of, whole_of
-from fragprune_plugins.workbench.distributed.sharded import ShardedEngine
+from fragprune_plugins.workbench.distributed import ShardedEngine, part_of, whole_of
 from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.finetune import api, resuming
 from fragprune_plugins.workbench.finetune import finished as finetuned
@@ -30,8 +29,7 @@ from fragprune_plugins.workbench.finetune.trial import tried
 from fragprune_plugins.workbench.goals import AtMost
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.models.written import require_place
-from fragprune_plugins.workbench.pruning.scores import keep_best, keep_needed
-from fragprune_plugins.workbench.pruning.visibility import visible
+from fragprune_plugins.workbench.pruning import keep_best, keep_needed, visible
 from fragprune_plugins.workbench.ranks import Ranks, joined, launched
 from fragprune_plugins.workbench.scenes.dataset import Dataset, load_photographs
 from fragprune_plugins.workbench.scenes.generated import views_near

@@ -28,8 +28,7 @@ from fragprune_plugins.workbench.commands.options import (
     SceneOptions,
     require_several,
 )
-from fragprune_plugins.workbench.distributed.processes import part_of
-from fragprune_plugins.workbench.distributed.sharded import ShardedEngine
+from fragprune_plugins.workbench.distributed import ShardedEngine, part_of
 from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.figures.pictures import save_image, stems
 from fragprune_plugins.workbench.figures.wording import nothing_drawn

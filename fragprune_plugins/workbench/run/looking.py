@@ -14,7 +14,7 @@ from fragprune_plugins.workbench.commands.opening import open_engine
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.finetune.trial import Trial, tried
 from fragprune_plugins.workbench.models.model import load
-from fragprune_plugins.workbench.pruning.scores import best, removal_error
+from fragprune_plugins.workbench.pruning import best, removal_error
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
 from fragprune_plugins.workbench.scenes.generated import views_near
 

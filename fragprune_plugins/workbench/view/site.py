@@ -23,8 +23,7 @@ from fragprune_plugins.workbench.figures.pictures import picture
 from fragprune_plugins.workbench.models.written import writable_folder
 from fragprune_plugins.workbench.scenes.dataset import Shot
 from fragprune_plugins.workbench.scenes.generated import bounds
-from fragprune_plugins.workbench.view.compact import compact
-from fragprune_plugins.workbench.view.packing import pack
+from fragprune_plugins.workbench.view.packing import compact, pack
 
 Site = dict[str, bytes]
 """Names of files, with slashes, and what they hold."""
