@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch.autograd.function import once_differentiable
@@ -101,26 +101,6 @@ Way = Literal["slice", "unslice"]
 """Forward, and backward."""
 
 
-class SliceKernels(Protocol):
-    """The compiled functions that cut Gaussians, and the device they run on."""
-
-    @property
-    def where(self) -> torch.device:
-        """The device on which the tensors must be."""
-
-    def empty(self, *shape: int) -> Tensor:
-        """An uninitialised float32 tensor of this shape on the device."""
-
-    def call(
-        self,
-        way: Way,
-        given: structs.Spacetime,
-        sliced: structs.Sliced,
-        to: structs.SpacetimeGrads | None = None,
-    ) -> None:
-        """Cut, or go back from the gradients by what was cut to those in ``to``."""
-
-
 @dataclass(frozen=True)
 class CpuKernels:
     """fragprune_slice and fragprune_unslice of the compiled library."""
@@ -134,7 +114,7 @@ class CpuKernels:
         return empty(self.workspace, *shape)
 
     def call(self, way: Way, *arguments: Any) -> None:
-        """Cut, or go back."""
+        """Cut, or go back: inputs, what was cut or its gradients, and gradients to fill."""
         error = binding.Error()
         passed = (each for each in (*arguments, error) if each is not None)
         status = getattr(self.library.calls, f"fragprune_{way}")(*map(ctypes.byref, passed))
@@ -157,6 +137,10 @@ class CudaKernels:
         passed = structs.Slicing(given, *(each for each in others if each is not None))
         blocks = blocks_of(given.count)
         launch(self.device, self.where, "slice", structs.MACROS, f"fp_{way}", blocks, passed)
+
+
+SliceKernels = CpuKernels | CudaKernels
+"""The compiled functions that cut Gaussians, and the device where tensors must be."""
 
 
 @cache

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View, one_line
-from fragprune_plugins.workbench.figures.clock import synchronize, timed
+from fragprune_plugins.workbench.figures.clock import standard_error, synchronize, timed
 
 Pass = Literal["forward", "forward_backward"]
 
@@ -109,7 +109,7 @@ def measure(
                 "evaluated_per_pixel": last[index].evaluated_per_pixel,
                 "ms_median": median,
                 "ms_min": min(times[index]),
-                "ms_se": _standard_error(times[index]),
+                "ms_se": standard_error(times[index]),
                 "ns_per_fragment": 1e6 * median / fragments if fragments else None,
                 "stages": {
                     name: statistics.median(part[name] for part in stages[index])
@@ -130,19 +130,19 @@ def translation(results: Sequence[dict[str, Any]], engine: str) -> dict[str, dic
         truncated, and ``share``, time over fragments.
     """
     found: dict[str, dict[str, float]] = {}
-    forward = [r for r in results if r["engine"] == engine and r["pass"] == "forward"]
-    for plain in forward:
-        for cut in forward:
-            same = all(plain[k] == cut[k] for k in ("scene", "width", "height", "gaussians"))
-            drawn = cut["fragments_per_pixel"] > 0
-            if same and drawn and cut["truncated"] and not plain["truncated"]:
-                time_ratio = plain["ms_median"] / cut["ms_median"]
-                fragments = plain["fragments_per_pixel"] / cut["fragments_per_pixel"]
-                found[f"{plain['scene']} {plain['width']}x{plain['height']}"] = {
-                    "fragments": fragments,
-                    "time": time_ratio,
-                    "share": time_ratio / fragments,
-                }
+    rows: dict[bool, dict[Any, dict[str, Any]]] = {True: {}, False: {}}
+    for row in results:
+        if row["engine"] == engine and row["pass"] == "forward":
+            work = tuple(row[key] for key in ("scene", "width", "height", "gaussians"))
+            rows[row["truncated"]][work] = row
+    for work, plain in rows[False].items():
+        cut = rows[True].get(work)
+        if cut is not None and cut["fragments_per_pixel"] > 0:
+            time_ratio = plain["ms_median"] / cut["ms_median"]
+            fragments = plain["fragments_per_pixel"] / cut["fragments_per_pixel"]
+            share = time_ratio / fragments
+            name = "{scene} {width}x{height}".format(**plain)
+            found[name] = {"fragments": fragments, "time": time_ratio, "share": share}
     return found
 
 
@@ -194,10 +194,6 @@ def _prepare(case: Case, engine: Engine) -> Callable[[], RasterOutputs]:
         return outputs
 
     return draw_and_differentiate
-
-
-def _standard_error(values: Sequence[float]) -> float:
-    return statistics.stdev(values) / len(values) ** 0.5 if len(values) > 1 else 0.0
 
 
 def _with_peak(

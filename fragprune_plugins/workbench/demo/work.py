@@ -7,7 +7,8 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +19,20 @@ from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.injection.launch import RunOptions, RunSummary, run
-from fragprune_plugins.learning.goals import Control, Pressure
+from fragprune_plugins.learning.goals import Control
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hooks import engine_for
-from fragprune_plugins.types import View
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import open_engine
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.demo.folder import claiming, clear
 from fragprune_plugins.workbench.demo.scene import POINTS, VIEWS, WIDTH, make_scene
-from fragprune_plugins.workbench.figures.evaluate import Candidate, frame_times, measure_all
+from fragprune_plugins.workbench.figures.evaluate import (
+    Candidate,
+    enlarged,
+    frame_times,
+    measure_all,
+)
 from fragprune_plugins.workbench.figures.recorded import Recorded
 from fragprune_plugins.workbench.figures.wording import describe, frames, headlines, outcome
 from fragprune_plugins.workbench.finetune.api import finetune
@@ -61,14 +66,12 @@ class DemoSettings:
     Attributes:
         iterations: number of iterations of the host's own training.
         finetune: number of iterations of stage 2.
-        pressure: weight of drawn fragments per pixel; None for the default.
         device: "cpu" or a CUDA device.
         views, width, points: of the scene, as ``make_scene`` takes them.
     """
 
     iterations: int = 1000
     finetune: int = 500
-    pressure: float | None = None
     seed: int = 0
     engine: str = "auto"
     device: str = "cpu"
@@ -83,7 +86,7 @@ def demo(*, out: Path, iters: int, seed: int, engine: EngineOptions) -> Report:
     settings = DemoSettings(
         iterations=iters, finetune=iters // 2, seed=seed, engine=engine.name, device=str(where)
     )
-    report = run_demo(out, settings, lambda line: click.echo(line, err=True))
+    report = run_demo(out, settings, partial(click.echo, err=True))
     larger = report["larger"]
     table = describe({"original": report["before"], "pruned": report["after"]})
     text = (
@@ -155,7 +158,9 @@ def run_demo(
             f"1/4  Training for {settings.iterations} iterations, then with a cutoff for "
             f"every Gaussian for {settings.finetune}"
         )
-        summary = run(command, _run_options(settings))
+        learning = Settings(iterations=settings.finetune, seed=settings.seed)
+        options = RunOptions(settings=learning, engine=settings.engine, device=settings.device)
+        summary = run(command, options)
     with _timed(seconds, "control"):
         say(f"2/4  The control: the same {settings.finetune} iterations without cutoffs")
         control = _control(scene, summary, settings)
@@ -172,13 +177,6 @@ def run_demo(
     with claiming(out, REPORT), replacing(out / REPORT) as path:
         path.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     return report
-
-
-def _run_options(settings: DemoSettings) -> RunOptions:
-    learning = Settings(
-        iterations=settings.finetune, goal=Pressure(settings.pressure), seed=settings.seed
-    )
-    return RunOptions(settings=learning, engine=settings.engine, device=settings.device)
 
 
 def _control(scene: Path, summary: RunSummary, settings: DemoSettings) -> Model:
@@ -267,7 +265,7 @@ def write_page(
     original, pruned = Candidate(one.untruncated()), Candidate(other)
     shots = sorted(load_dataset(scene).test, key=lambda shot: shot.name != _FIRST)
     rasterizer = engine_for(engine, device)
-    views = [_larger(shot.view).to(device) for shot in shots]
+    views = [enlarged(shot.view, LARGER).to(device) for shot in shots]
     times = frame_times([original, pruned], views, rasterizer, repeats=_REPEATS)
     size = f"{views[0].width}x{views[0].height}"
     report["larger"] = {"size": size, "before": times[0], "after": times[1]}
@@ -297,7 +295,3 @@ def write_page(
     with replacing(out / "index.html") as path:
         path.write_text(text, encoding="utf-8")
     return [*(f"pictures/{file}" for file in files), "index.html"]
-
-
-def _larger(view: View) -> View:
-    return replace(view, width=LARGER * view.width, height=LARGER * view.height)

@@ -15,7 +15,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +78,7 @@ def prove(say: Callable[[str], None] | None = None, repeats: int = 9) -> Report:
         say: is told how far it is; None tells stderr.
         repeats: timed frames of each row.
     """
-    say = say or (lambda text: click.echo(text, err=True))
+    say = say or partial(click.echo, err=True)
     kind = "cuda" if torch.cuda.is_available() else "cpu"
     contestants, left_out = list(_ours(kind)), {}
     for name in peers.installed():

@@ -18,7 +18,7 @@ from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.area import SQUARED_RADIUS
 from fragprune_plugins.plugins.hooks import engine_for, thresholds_for
 from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View, one_line
-from fragprune_plugins.workbench.figures.clock import Made, timed
+from fragprune_plugins.workbench.figures.clock import Made, standard_error, timed
 from fragprune_plugins.workbench.figures.extents import covered
 from fragprune_plugins.workbench.figures.metrics import lpips, psnr, ssim
 from fragprune_plugins.workbench.models import model as models
@@ -147,14 +147,16 @@ def measure_all(
         count = candidate.gaussians or len(splats)
         reports.append({"target": shots[0].target, **means, "gaussians": count})
 
-    views = [
-        replace(view, width=enlarge * view.width, height=enlarge * view.height)
-        for view in (shot.view for shot in shots)
-    ]
+    views = [enlarged(shot.view, enlarge) for shot in shots]
     frames = frame_times(candidates, views, engine, repeats=repeats)
     for report, frame in zip(reports, frames, strict=True):
         report |= frame | {"engine": engine.name, "device": str(device), "views": len(shots)}
     return reports
+
+
+def enlarged(view: View, times: int) -> View:
+    """The same view in a picture so many times as wide and high."""
+    return replace(view, width=times * view.width, height=times * view.height)
 
 
 @torch.no_grad()
@@ -225,12 +227,7 @@ def frame_times(
                 rounds[-1].append(timed(frame, device)[1])
     reports = []
     for rounds in times:
-        medians = [statistics.median(frames) for frames in rounds]
-        spread = statistics.stdev(medians) if len(medians) > 1 else 0.0
-        reports.append(
-            {
-                "frame_ms": statistics.median(ms for frames in rounds for ms in frames),
-                "frame_ms_se": spread / len(medians) ** 0.5,
-            }
-        )
+        middle = statistics.median(ms for frames in rounds for ms in frames)
+        error = standard_error([statistics.median(frames) for frames in rounds])
+        reports.append({"frame_ms": middle, "frame_ms_se": error})
     return reports

@@ -18,6 +18,7 @@ from fragprune_plugins.learning.goals import Control, Pressure
 from fragprune_plugins.learning.interruption import Terminate
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.targets import FEWEST
+from fragprune_plugins.workbench.figures.clock import standard_error
 from fragprune_plugins.workbench.figures.evaluate import Candidate, psnrs
 from fragprune_plugins.workbench.finetune.loop import FinetuneResult
 from fragprune_plugins.workbench.goals import AtMost
@@ -128,8 +129,8 @@ def strongest(
                 break
             figures, fragments = _held_out(last, held_out, engine)
             losses = [was - now for was, now in zip(reference, figures, strict=True)]
-            spread = statistics.stdev(losses) / len(losses) ** 0.5 if len(losses) > 1 else 0.0
-            trial = Trial(last.progress.pressure, statistics.fmean(losses), spread, fragments)
+            loss, error = statistics.fmean(losses), standard_error(losses)
+            trial = Trial(last.progress.pressure, loss, error, fragments)
             say(
                 f"Loss against the control: {trial.loss:.3f} dB at {fragments:.1f} fragments/pixel."
             )

@@ -34,6 +34,8 @@ from fragprune_plugins.workbench.ranks import Ranks, joined, launched
 from fragprune_plugins.workbench.scenes.dataset import Dataset, load_photographs
 from fragprune_plugins.workbench.scenes.generated import views_near
 
+_say = partial(click.echo, err=True)
+
 
 @dataclass(frozen=True)
 class _Opened:
@@ -166,10 +168,6 @@ def _report(opened: _Opened, over: Finetuned, measured: list[dict[str, Any]] | N
     if not result.interrupted:
         opened.checkpoints.clear()  # not before: a kill while measuring goes on from it too
     return report
-
-
-def _say(text: str) -> None:
-    click.echo(text, err=True)
 
 
 def _keep(whole: Model, asked: Asked, dataset: Dataset, engine: Engine) -> Model:

@@ -217,12 +217,7 @@ class Dataset:
 
 def load_photographs(photographs: Photographs) -> Dataset:
     """Load the photographs of a run with ``load_dataset``."""
-    return load_dataset(
-        photographs.folder,
-        resolution=photographs.resolution,
-        white_background=photographs.white_background,
-        images=photographs.images,
-    )
+    return load_dataset(**vars(photographs))
 
 
 def load_dataset(

@@ -42,11 +42,6 @@ CUTOFF_MAX = -2 * math.log(ALPHA_MIN)
 _HALF_MAX = 65504.0
 
 
-def _texels(degree: int) -> int:
-    """Texels of four words, eight half floats, that hold the harmonics of a degree."""
-    return -(-3 * (degree + 1) ** 2 // 8)
-
-
 def pack(model: Model) -> tuple[bytes, dict[str, Any]]:
     """A model's tables, and what is needed to read them.
 
@@ -77,7 +72,8 @@ def pack(model: Model) -> tuple[bytes, dict[str, Any]]:
     geometry[:, 6] = _pair(sizes[:, 0], sizes[:, 1])
     geometry[:, 7] = sizes[:, 2]
 
-    harmonics = np.zeros((count, _texels(degree) * 8), dtype="<f2")
+    texels = -(-3 * (degree + 1) ** 2 // 8)  # of four words, eight half floats
+    harmonics = np.zeros((count, texels * 8), dtype="<f2")
     values = _array(torch.cat([model.f_dc, model.f_rest], dim=1).flatten(1), "<f4")
     harmonics[:, : values.shape[1]] = values.clip(-_HALF_MAX, _HALF_MAX)
     facts = {

@@ -81,8 +81,6 @@ def make_site(
     layers: Sequence[Layer],
     cameras: Sequence[Shown],
     start: View,
-    *,
-    up: Sequence[float] = (0.0, -1.0, 0.0),
 ) -> Site:
     """All files of a viewer.
 
@@ -90,7 +88,6 @@ def make_site(
         layers: one or two; the first is on the left.
         cameras: to choose from; may be none.
         start: the first camera; its background is the page's.
-        up: (3,) what is up in the world.
 
     Raises:
         DatasetError: a photograph cannot be read.
@@ -116,7 +113,7 @@ def make_site(
         "cameras": listed,
         "start": listed[0] if cameras and start is cameras[0].view else camera(start),
         "background": start.background.tolist(),
-        "up": list(up),
+        "up": [0.0, -1.0, 0.0],  # as in COLMAP's worlds
         "centre": centre.tolist(),
         "radius": radius,
     }
