@@ -53,8 +53,8 @@ if TYPE_CHECKING:
     from fragprune_plugins.workbench.ranks import joined as joined
     from fragprune_plugins.workbench.scenes.cameras import load_cameras as load_cameras
     from fragprune_plugins.workbench.scenes.dataset import load_dataset as load_dataset
+    from fragprune_plugins.workbench.scenes.generated import own_pictures as own_pictures
     from fragprune_plugins.workbench.scenes.generated import views_near as views_near
-    from fragprune_plugins.workbench.scenes.itself import own_pictures as own_pictures
     from fragprune_plugins.workbench.scenes.pinhole import look_at as look_at
 
 __version__ = VERSION
@@ -78,8 +78,7 @@ _NAMES = {
     "workbench.ranks": "joined",
     "workbench.scenes.cameras": "load_cameras",
     "workbench.scenes.dataset": "load_dataset",
-    "workbench.scenes.generated": "views_near",
-    "workbench.scenes.itself": "own_pictures",
+    "workbench.scenes.generated": "own_pictures views_near",
     "workbench.scenes.pinhole": "look_at",
 }
 """By module, the names that it gives this package."""

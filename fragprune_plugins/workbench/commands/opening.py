@@ -21,8 +21,7 @@ from fragprune_plugins.workbench.figures.wording import ITSELF
 from fragprune_plugins.workbench.ranks import launched, local_rank
 from fragprune_plugins.workbench.scenes.cameras import divided, load_cameras, load_scene_cameras
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
-from fragprune_plugins.workbench.scenes.generated import around
-from fragprune_plugins.workbench.scenes.itself import own_pictures
+from fragprune_plugins.workbench.scenes.generated import around, own_pictures
 from fragprune_plugins.workbench.scenes.output import (
     ARGUMENTS,
     CAMERAS,
