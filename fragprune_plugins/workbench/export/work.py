@@ -13,8 +13,7 @@ from fragprune_plugins.files.ply import THRESHOLD_COLUMN
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.models import formats
-from fragprune_plugins.workbench.models.model import load, save
-from fragprune_plugins.workbench.models.written import describe_written, require_place
+from fragprune_plugins.workbench.models.model import describe_written, load, require_place, save
 from fragprune_plugins.workbench.pruning import visible
 
 

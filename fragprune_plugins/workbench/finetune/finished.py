@@ -30,7 +30,7 @@ from fragprune_plugins.workbench.finetune.loop import FinetuneResult
 from fragprune_plugins.workbench.finetune.searching import Bounded
 from fragprune_plugins.workbench.finetune.trial import DROPOUT, KEEP, Keep
 from fragprune_plugins.workbench.models import formats
-from fragprune_plugins.workbench.models.written import describe_written
+from fragprune_plugins.workbench.models.model import describe_written
 from fragprune_plugins.workbench.scenes.dataset import Dataset
 
 LOST = 0.05

@@ -28,7 +28,7 @@ from fragprune_plugins.workbench.finetune.searching import Bounded, strongest
 from fragprune_plugins.workbench.finetune.trial import tried
 from fragprune_plugins.workbench.goals import AtMost
 from fragprune_plugins.workbench.models import model as models
-from fragprune_plugins.workbench.models.written import require_place
+from fragprune_plugins.workbench.models.model import require_place
 from fragprune_plugins.workbench.pruning import keep_best, keep_needed, visible
 from fragprune_plugins.workbench.ranks import Ranks, joined, launched
 from fragprune_plugins.workbench.scenes.dataset import Dataset, load_photographs

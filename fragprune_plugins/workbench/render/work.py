@@ -32,8 +32,7 @@ from fragprune_plugins.workbench.distributed import ShardedEngine, part_of
 from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.figures.pictures import save_image, stems
 from fragprune_plugins.workbench.figures.wording import nothing_drawn
-from fragprune_plugins.workbench.models.model import load
-from fragprune_plugins.workbench.models.written import writable_folder
+from fragprune_plugins.workbench.models.model import load, writable_folder
 from fragprune_plugins.workbench.ranks import Ranks, joined
 from fragprune_plugins.workbench.render import filming
 from fragprune_plugins.workbench.scenes.cameras import divided, load_cameras

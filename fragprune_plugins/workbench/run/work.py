@@ -1,10 +1,14 @@
-"""Runs a host's command, and measures what stage 2 did on the views that the host holds out."""
+"""Runs a host's command, and measures what stage 2 did on the views that the host holds out.
+
+Between the stages it looks whether the model knows its photographs by heart.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import logging
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +16,9 @@ import click
 
 from fragprune_plugins.errors import FragpruneError
 from fragprune_plugins.files import records
+from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.injection import launch
+from fragprune_plugins.injection.options import Found
 from fragprune_plugins.injection.process import current_gpu
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.workbench.commands.command import JSON, Report
@@ -31,10 +37,13 @@ from fragprune_plugins.workbench.figures.wording import (
     next_steps,
     outcome,
 )
-from fragprune_plugins.workbench.finetune.trial import Trial
+from fragprune_plugins.workbench.finetune.trial import Trial, tried
 from fragprune_plugins.workbench.models.model import load
-from fragprune_plugins.workbench.run.looking import Looking
+from fragprune_plugins.workbench.pruning import best, removal_error
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
+from fragprune_plugins.workbench.scenes.generated import views_near
+
+log = logging.getLogger("fragprune")
 
 _WHERE = {"joint": "inside the training"}
 _CONTROL = (
@@ -226,3 +235,34 @@ def _viewable(model: Path) -> bool:
     except FragpruneError:
         return False
     return True
+
+
+@dataclass
+class Looking:
+    """What ``RunOptions.look`` calls.
+
+    Attributes:
+        engine: draws.
+        trial: what was found; None before, and where nothing could be tried.
+    """
+
+    engine: EngineOptions
+    trial: Trial | None = None
+
+    def __call__(self, ply: Path, photographs: Photographs, settings: Settings) -> Found:
+        """Make the trial of ``fragprune finetune``, and score the Gaussians as it does."""
+        try:
+            return self._look(ply, photographs, settings)
+        except FragpruneError as error:  # the host may read and draw more than we do
+            log.warning("not tried whether it knows its photographs by heart, because of %s", error)
+            return Found(settings)
+
+    def _look(self, ply: Path, photographs: Photographs, settings: Settings) -> Found:
+        engine, device = open_engine(self.engine)
+        model, dataset = load(ply, device=device), load_photographs(photographs).to(device)
+        trial, kept = tried(model, dataset, settings, engine=engine, say=log.info), None
+        if isinstance(trial.keep, float):
+            views = views_near(dataset.train, seed=settings.seed)
+            kept = best(removal_error(model, model.falloff, views, engine), trial.keep).cpu()
+        self.trial = trial
+        return Found(trial.settings, kept)

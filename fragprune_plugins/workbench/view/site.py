@@ -28,7 +28,7 @@ from fragprune_plugins.files.model import Model
 from fragprune_plugins.types import View
 from fragprune_plugins.workbench.figures.page import allowed
 from fragprune_plugins.workbench.figures.pictures import picture
-from fragprune_plugins.workbench.models.written import writable_folder
+from fragprune_plugins.workbench.models.model import writable_folder
 from fragprune_plugins.workbench.scenes.dataset import Shot
 from fragprune_plugins.workbench.scenes.generated import bounds
 from fragprune_plugins.workbench.view.packing import compact, pack
