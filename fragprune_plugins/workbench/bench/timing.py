@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import platform
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -12,6 +14,7 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.engines import Engine
+from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View, one_line
 from fragprune_plugins.workbench.figures.clock import standard_error, synchronize, timed
 
@@ -220,3 +223,37 @@ def _status(field: str) -> float:
         if line.startswith(field):
             return float(line.split()[1]) / 1024
     raise OSError(f"no {field} in /proc/self/status")
+
+
+def describe_machine(device: torch.device | str = "cpu") -> dict[str, Any]:
+    """The processor, and the versions that decide about speed.
+
+    Returns:
+        processor, cores, platform, torch, native (build of the cpu engine, or None), gpu (name of
+        the device, None for the CPU).
+    """
+    device = torch.device(device)
+    native = binding.chosen()
+    return {
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "platform": platform.platform(),
+        "torch": torch.__version__,
+        "native": native.build if isinstance(native, binding.Library) else None,
+        "gpu": torch.cuda.get_device_name(device) if device.type == "cuda" else None,
+    }
+
+
+def load_average() -> float | None:
+    """Processes that run or wait, mean over a minute; None where the system does not tell."""
+    return os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+
+
+def _processor() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()

@@ -14,9 +14,16 @@ from torch import Tensor
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.plugins.hooks import thresholds_for
 from fragprune_plugins.types import RasterInputs, Splats, View
-from fragprune_plugins.workbench.bench.machine import describe_machine, load_average
 from fragprune_plugins.workbench.bench.scene import make_scene, make_view
-from fragprune_plugins.workbench.bench.timing import Case, Pass, measure, scaling, translation
+from fragprune_plugins.workbench.bench.timing import (
+    Case,
+    Pass,
+    describe_machine,
+    load_average,
+    measure,
+    scaling,
+    translation,
+)
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import cameras_of, open_engine
 from fragprune_plugins.workbench.commands.options import EngineOptions

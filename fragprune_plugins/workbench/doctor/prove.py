@@ -33,9 +33,14 @@ from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import FragpruneError
 from fragprune_plugins.slicing.cutting import expect_right
 from fragprune_plugins.types import RasterInputs, Splats, one_line
-from fragprune_plugins.workbench.bench.machine import describe_machine, load_average
 from fragprune_plugins.workbench.bench.scene import make_scene, make_view
-from fragprune_plugins.workbench.bench.timing import Case, Pass, measure
+from fragprune_plugins.workbench.bench.timing import (
+    Case,
+    Pass,
+    describe_machine,
+    load_average,
+    measure,
+)
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.doctor import peers
 from fragprune_plugins.workbench.doctor.emulated import (
