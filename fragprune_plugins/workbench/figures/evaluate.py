@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -55,15 +55,18 @@ class Candidate:
         """(N,) to draw a view with; None for no truncation."""
         return thresholds_for(inputs, self.model.thresholds if self.cut is None else self.cut)
 
-    def inputs(self, view: View, splats: Splats) -> RasterInputs:
-        """The inputs of one view with the activated model; only the image is asked for."""
-        return RasterInputs(view, splats, planes=(), **{**self.model.rules, **self.drawing})
+    @cached_property
+    def splats(self) -> Splats:
+        """The activated Gaussians."""
+        return self.model.splats()
 
-    def draw(
-        self, engine: Engine, view: View, splats: Splats, *, counts: bool = False
-    ) -> RasterOutputs:
-        """Draw one view of the activated model, optionally with counts of fragments."""
-        inputs = replace(self.inputs(view, splats), counts=counts)
+    def inputs(self, view: View) -> RasterInputs:
+        """The inputs of one view; only the image is asked for."""
+        return RasterInputs(view, self.splats, planes=(), **{**self.model.rules, **self.drawing})
+
+    def draw(self, engine: Engine, view: View, *, counts: bool = False) -> RasterOutputs:
+        """Draw one view, optionally with counts of fragments."""
+        inputs = replace(self.inputs(view), counts=counts)
         return engine.rasterize(inputs, self.thresholds(inputs))
 
 
@@ -125,12 +128,11 @@ def measure_all(
     if isinstance(engine, str):
         engine = engine_for(engine, device)
     shots = [shot.to(device) for shot in shots]
-    drawn = [candidate.model.splats() for candidate in candidates]
     reports: list[dict[str, Any]] = []
-    for candidate, splats in zip(candidates, drawn, strict=True):
+    for candidate in candidates:
         rows: list[dict[str, float | None]] = []
         for shot in bar(shots, "measuring"):
-            outputs, picture = candidate.draw(engine, shot.view, splats), shot.image
+            outputs, picture = candidate.draw(engine, shot.view), shot.image
             seen = shot.looked_at(outputs.image)
             rows.append(
                 {
@@ -138,13 +140,11 @@ def measure_all(
                     "ssim": ssim(seen, picture),
                     "lpips": lpips(seen, picture),
                     **{name: float(getattr(outputs, name)) for name in _COUNTED},
-                    "area_per_pixel": covered_per_pixel(
-                        engine, candidate.inputs(shot.view, splats)
-                    ),
+                    "area_per_pixel": covered_per_pixel(engine, candidate.inputs(shot.view)),
                 }
             )
         means = {name: _mean([row[name] for row in rows]) for name in rows[0]}
-        count = candidate.gaussians or len(splats)
+        count = candidate.gaussians or len(candidate.model)
         reports.append({"target": shots[0].target, **means, "gaussians": count})
 
     views = [enlarged(shot.view, enlarge) for shot in shots]
@@ -164,10 +164,10 @@ def psnrs(
     candidate: Candidate, shots: Sequence[Shot], engine: Engine
 ) -> tuple[list[float], list[float]]:
     """PSNR of each view, dB, and the fragments per pixel of each."""
-    splats, figures, fragments = candidate.model.splats(), [], []
+    figures, fragments = [], []
     for shot in shots:
-        shot = shot.to(splats.device)
-        outputs = candidate.draw(engine, shot.view, splats)
+        shot = shot.to(candidate.model.device)
+        outputs = candidate.draw(engine, shot.view)
         figures.append(psnr(shot.looked_at(outputs.image), shot.image))
         fragments.append(float(outputs.fragments_per_pixel))
     return figures, fragments
@@ -213,16 +213,15 @@ def frame_times(
         One dict a candidate: frame_ms and frame_ms_se, as those of ``measure``.
     """
     device = candidates[0].model.device
-    drawn = [candidate.model.splats() for candidate in candidates]
     times: list[list[list[float]]] = [[] for _ in candidates]  # candidate, repeat, view
-    turns = list(zip(candidates, drawn, times, strict=True))
+    turns = list(zip(candidates, times, strict=True))
     for _ in bar(range(repeats), "timing frames"):
         for rounds in times:
             rounds.append([])
         for view in views:
             turns.reverse()  # neither is always the one that finds a cold cache
-            for candidate, splats, rounds in turns:
-                inputs = candidate.inputs(view, splats)
+            for candidate, rounds in turns:
+                inputs = candidate.inputs(view)
                 frame = partial(engine.rasterize, inputs, candidate.thresholds(inputs))
                 rounds[-1].append(timed(frame, device)[1])
     reports = []

@@ -170,12 +170,11 @@ def draw_panels(
         The files, one for each drawn view.
     """
     files = []
-    drawn = {name: candidate.model.splats() for name, candidate in columns.items()}
     chosen = evenly(shots, PANELS)
     for stem, shot in zip(stems([shot.name for shot in chosen]), chosen, strict=True):
         with torch.no_grad():
             outputs = {
-                name: candidate.draw(engine, shot.view, drawn[name], counts=True)
+                name: candidate.draw(engine, shot.view, counts=True)
                 for name, candidate in columns.items()
             }
         heat = {

@@ -171,13 +171,12 @@ class _Drawing:
         self.fragments: dict[int, float] = {}
         self._named, self._device, self._ranks = named, device, ranks
         self._candidate = Candidate(part_of(whole, ranks, device) if shard else whole)
-        self._splats = self._candidate.model.splats()
         self._engine = ShardedEngine(engine, ranks) if shard else engine
 
     @torch.no_grad()
     def draw(self, index: int) -> RasterOutputs:
         view = self._named[index][1].to(self._device)
-        outputs = self._candidate.draw(self._engine, view, self._splats)
+        outputs = self._candidate.draw(self._engine, view)
         self.fragments[index] = float(outputs.fragments_per_pixel)
         return outputs
 

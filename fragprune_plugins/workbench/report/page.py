@@ -116,7 +116,6 @@ def draw_views(
         enlarge: how many times as wide and high as the photograph both models are drawn.
     """
 
-    models = [(original, original.model.splats()), (pruned, pruned.model.splats())]
     chosen = [shot.to(original.model.xyz.device) for shot in evenly(shots, SHOWN)]
     names = stems([shot.name for shot in chosen])
     maps: dict[str, dict[str, Tensor]] = {"fragments": {}, "error": {}}
@@ -125,10 +124,10 @@ def draw_views(
         size, large = (shot.view.width, shot.view.height), enlarged(shot.view, enlarge)
         save_image(folder / f"{name}_photograph.png", shot.image)
         per_pixel = []
-        for model, (each, splats) in zip(NAMES, models, strict=True):
+        for model, each in zip(NAMES, (original, pruned), strict=True):
             with torch.no_grad():
-                out = each.draw(engine, large, splats, counts=True)
-                image = out.image if enlarge == 1 else each.draw(engine, shot.view, splats).image
+                out = each.draw(engine, large, counts=True)
+                image = out.image if enlarge == 1 else each.draw(engine, shot.view).image
             assert out.fragments is not None
             save_image(folder / f"{name}_{model}.png", out.image)
             error = shot.looked_at(image).clamp(0, 1) - shot.image.clamp(0, 1)
