@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -144,8 +145,8 @@ def measure_all(
                 }
             )
         means = {name: _mean([row[name] for row in rows]) for name in rows[0]}
-        count = candidate.gaussians or len(candidate.model)
-        reports.append({"target": shots[0].target, **means, "gaussians": count})
+        whole = candidate.gaussians or len(candidate.model)
+        reports.append({"target": shots[0].target, **means, "gaussians": whole})
 
     views = [enlarged(shot.view, enlarge) for shot in shots]
     frames = frame_times(candidates, views, engine, repeats=repeats)
@@ -212,21 +213,28 @@ def frame_times(
     Returns:
         One dict a candidate: frame_ms and frame_ms_se, as those of ``measure``.
     """
-    device = candidates[0].model.device
-    times: list[list[list[float]]] = [[] for _ in candidates]  # candidate, repeat, view
-    turns = list(zip(candidates, times, strict=True))
-    for _ in bar(range(repeats), "timing frames"):
-        for rounds in times:
-            rounds.append([])
-        for view in views:
-            turns.reverse()  # neither is always the one that finds a cold cache
-            for candidate, rounds in turns:
+    turns = rounds(candidates, views, engine)
+    times = [next(turns) for _ in bar(range(repeats), "timing frames")]
+    return [
+        {
+            "frame_ms": statistics.median(ms for frames in repeated for ms in frames),
+            "frame_ms_se": standard_error([statistics.median(frames) for frames in repeated]),
+        }
+        for repeated in zip(*times, strict=True)
+    ]
+
+
+def rounds(
+    candidates: Sequence[Candidate], views: Sequence[View], engine: Engine
+) -> Iterator[list[list[float]]]:
+    """Frames of candidates in turns, without end: for each of them the milliseconds by view."""
+    order = list(enumerate(candidates))
+    for turn in count():
+        spent: list[list[float]] = [[] for _ in candidates]
+        for number, view in enumerate(views):
+            # Of two neither is always the one that finds a cold cache.
+            for index, candidate in order[:: 1 if (turn + number) % 2 else -1]:
                 inputs = candidate.inputs(view)
                 frame = partial(engine.rasterize, inputs, candidate.thresholds(inputs))
-                rounds[-1].append(timed(frame, device)[1])
-    reports = []
-    for rounds in times:
-        middle = statistics.median(ms for frames in rounds for ms in frames)
-        error = standard_error([statistics.median(frames) for frames in rounds])
-        reports.append({"frame_ms": middle, "frame_ms_se": error})
-    return reports
+                spent[index].append(timed(frame, candidate.model.device)[1])
+        yield spent
