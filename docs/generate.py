@@ -121,7 +121,7 @@ def support() -> str:
     """What the installed adapters serve."""
     from fragprune_plugins.engines import ENGINES
     from fragprune_plugins.plugins.loading import load_plugins
-    from fragprune_plugins.workbench.adapters.work import scripts as training_scripts
+    from fragprune_plugins.workbench.adapters import scripts as training_scripts
 
     adapters = load_plugins().adapters
     head = ["host", "adapter", "states", "scripts that train"]

@@ -35,26 +35,26 @@ if TYPE_CHECKING:
     from fragprune_plugins.types import RasterOutputs as RasterOutputs
     from fragprune_plugins.types import Splats as Splats
     from fragprune_plugins.types import View as View
-    from fragprune_plugins.workbench.distributed.processes import part_of as part_of
-    from fragprune_plugins.workbench.distributed.processes import whole_of as whole_of
-    from fragprune_plugins.workbench.distributed.sharded import ShardedEngine as ShardedEngine
-    from fragprune_plugins.workbench.figures.drawing import rasterize as rasterize
+    from fragprune_plugins.workbench.distributed import ShardedEngine as ShardedEngine
+    from fragprune_plugins.workbench.distributed import part_of as part_of
+    from fragprune_plugins.workbench.distributed import whole_of as whole_of
     from fragprune_plugins.workbench.figures.evaluate import measure as measure
     from fragprune_plugins.workbench.figures.viewing import overview as overview
+    from fragprune_plugins.workbench.figures.viewing import rasterize as rasterize
     from fragprune_plugins.workbench.figures.viewing import render_view as render_view
     from fragprune_plugins.workbench.finetune.api import finetune as finetune
-    from fragprune_plugins.workbench.finetune.result import FinetuneResult as FinetuneResult
+    from fragprune_plugins.workbench.finetune.loop import FinetuneResult as FinetuneResult
     from fragprune_plugins.workbench.goals import AtMost as AtMost
     from fragprune_plugins.workbench.goals import Faster as Faster
     from fragprune_plugins.workbench.models.model import load as load
     from fragprune_plugins.workbench.models.model import save as save
-    from fragprune_plugins.workbench.pruning.scores import keep_best as keep_best
-    from fragprune_plugins.workbench.pruning.scores import keep_needed as keep_needed
+    from fragprune_plugins.workbench.pruning import keep_best as keep_best
+    from fragprune_plugins.workbench.pruning import keep_needed as keep_needed
     from fragprune_plugins.workbench.ranks import joined as joined
     from fragprune_plugins.workbench.scenes.cameras import load_cameras as load_cameras
     from fragprune_plugins.workbench.scenes.dataset import load_dataset as load_dataset
+    from fragprune_plugins.workbench.scenes.generated import own_pictures as own_pictures
     from fragprune_plugins.workbench.scenes.generated import views_near as views_near
-    from fragprune_plugins.workbench.scenes.itself import own_pictures as own_pictures
     from fragprune_plugins.workbench.scenes.pinhole import look_at as look_at
 
 __version__ = VERSION
@@ -67,21 +67,18 @@ _NAMES = {
     "learning.thresholds": "ThresholdStore",
     "plugins.hooks": "engine_for",
     "types": "Footprints RasterInputs RasterOutputs Splats View",
-    "workbench.distributed.processes": "part_of whole_of",
-    "workbench.distributed.sharded": "ShardedEngine",
-    "workbench.figures.drawing": "rasterize",
+    "workbench.distributed": "ShardedEngine part_of whole_of",
     "workbench.figures.evaluate": "measure",
-    "workbench.figures.viewing": "overview render_view",
+    "workbench.figures.viewing": "overview rasterize render_view",
     "workbench.finetune.api": "finetune",
-    "workbench.finetune.result": "FinetuneResult",
+    "workbench.finetune.loop": "FinetuneResult",
     "workbench.goals": "AtMost Faster",
     "workbench.models.model": "load save",
-    "workbench.pruning.scores": "keep_best keep_needed",
+    "workbench.pruning": "keep_best keep_needed",
     "workbench.ranks": "joined",
     "workbench.scenes.cameras": "load_cameras",
     "workbench.scenes.dataset": "load_dataset",
-    "workbench.scenes.generated": "views_near",
-    "workbench.scenes.itself": "own_pictures",
+    "workbench.scenes.generated": "own_pictures views_near",
     "workbench.scenes.pinhole": "look_at",
 }
 """By module, the names that it gives this package."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from reference_renderer.covariance import covariances, project_covariances
-from reference_renderer.scene import Camera, Gaussians, Options
+from reference_renderer.scene import Camera, Gaussians, Options, Table
 from reference_renderer.sh import sh_colors
 
 TILE = 16
@@ -22,7 +22,7 @@ MIP_FLOOR = 1e-6
 
 
 @dataclass(frozen=True)
-class Footprints:
+class Footprints(Table):
     """K Gaussians on the image.
 
     Attributes:
@@ -48,21 +48,6 @@ class Footprints:
     felt: Tensor | None = None
     plane: Tensor | None = None
     normal: Tensor | None = None
-
-    def take(self, rows: Tensor) -> Footprints:
-        """The footprints of these rows (M,), in their order."""
-        return Footprints(
-            mean2d=self.mean2d[rows],
-            conic=self.conic[rows],
-            depth=self.depth[rows],
-            opacity=self.opacity[rows],
-            color=self.color[rows],
-            radius=self.radius[rows],
-            features=None if self.features is None else self.features[rows],
-            felt=None if self.felt is None else self.felt[rows],
-            plane=None if self.plane is None else self.plane[rows],
-            normal=None if self.normal is None else self.normal[rows],
-        )
 
 
 def transform(points: Tensor, matrix: Tensor) -> Tensor:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final, Literal
+from dataclasses import dataclass, replace
+from typing import Any, Final, Literal, TypeVar
 
 from torch import Tensor
 
@@ -15,6 +15,19 @@ RIM_REACH: Final = 4.6
 
 FALLOFF_MIN: Final = 1e-4
 """Least falloff that reach may take: keeps -2 ln(.) finite."""
+
+
+SomeTable = TypeVar("SomeTable", bound="Table")
+
+
+class Table:
+    """A dataclass whose tensors have a row for each Gaussian."""
+
+    def take(self: SomeTable, rows: Tensor) -> SomeTable:
+        """The same of these rows (K,), in their order; all others get zero gradient."""
+        tensors = {name: each for name, each in vars(self).items() if isinstance(each, Tensor)}
+        taken: dict[str, Any] = {name: each[rows] for name, each in tensors.items()}
+        return replace(self, **taken)  # type: ignore[type-var]
 
 
 @dataclass(frozen=True)
@@ -43,7 +56,7 @@ class Camera:
 
 
 @dataclass(frozen=True)
-class Gaussians:
+class Gaussians(Table):
     """N activated Gaussians; either scales and rotations or cov3d, either sh or colors.
 
     Attributes:
@@ -72,20 +85,6 @@ class Gaussians:
     def flat(self) -> bool:
         """Whether they are surfels, which lie in the plane of their first two axes."""
         return self.scales is not None and self.scales.shape[1] == 2
-
-    def take(self, rows: Tensor) -> Gaussians:
-        """The Gaussians of these rows (K,), in their order; all others get zero gradient."""
-        return Gaussians(
-            means=self.means[rows],
-            opacities=self.opacities[rows],
-            scales=None if self.scales is None else self.scales[rows],
-            rotations=None if self.rotations is None else self.rotations[rows],
-            cov3d=None if self.cov3d is None else self.cov3d[rows],
-            sh=None if self.sh is None else self.sh[rows],
-            colors=None if self.colors is None else self.colors[rows],
-            sh_degree=self.sh_degree,
-            features=None if self.features is None else self.features[rows],
-        )
 
 
 @dataclass(frozen=True)

@@ -46,8 +46,8 @@ from fragprune_plugins.learning.goals import Control, Pressure
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs
-from fragprune_plugins.workbench.bench.machine import describe_machine
 from fragprune_plugins.workbench.bench.scene import make_scene, make_view
+from fragprune_plugins.workbench.bench.timing import describe_machine
 from fragprune_plugins.workbench.finetune import loop, losses
 from fragprune_plugins.workbench.finetune.api import finetune
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Photograph

@@ -100,7 +100,6 @@ def compare(args: Namespace) -> None:
 def frames(drawn: list[Candidate], dataset: Dataset, enlarge: int) -> list[float]:
     """Least milliseconds of a frame of each candidate, mean over four held-out views."""
     engine = engine_for("cpu", torch.device("cpu"))
-    splats = [each.model.splats() for each in drawn]
     views = [
         replace(shot.view, width=enlarge * shot.view.width, height=enlarge * shot.view.height)
         for shot in dataset.test[:4]
@@ -109,7 +108,7 @@ def frames(drawn: list[Candidate], dataset: Dataset, enlarge: int) -> list[float
     for turn in range(9):
         for at, view in enumerate(views):
             for index in range(len(drawn))[:: -1 if turn % 2 else 1]:
-                inputs = drawn[index].inputs(view, splats[index])
+                inputs = drawn[index].inputs(view)
                 thresholds = drawn[index].thresholds(inputs)
                 started = time.process_time()
                 engine.rasterize(inputs, thresholds)

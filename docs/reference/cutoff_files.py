@@ -137,7 +137,7 @@ def write(out: Path) -> dict[str, Any]:
     """
     from fragprune_plugins.workbench.figures.metrics import psnr
     from fragprune_plugins.workbench.figures.pictures import save_image
-    from fragprune_plugins.workbench.models.written import writable_folder
+    from fragprune_plugins.workbench.models.model import writable_folder
 
     writable_folder(out)
     scenes: dict[str, Any] = {}

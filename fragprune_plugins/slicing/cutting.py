@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch.autograd.function import once_differentiable
@@ -97,28 +97,13 @@ def check_harmonics(splats: SpacetimeSplats, moment: Moment) -> None:
 # ---- compiled code -----------------------------------------------------------------------------
 
 
-class SliceKernels(Protocol):
-    """The compiled functions that cut Gaussians, and the device they run on."""
-
-    @property
-    def where(self) -> torch.device:
-        """The device on which the tensors must be."""
-
-    def empty(self, *shape: int) -> Tensor:
-        """An uninitialised float32 tensor of this shape on the device."""
-
-    def slice(self, given: structs.Spacetime, to: structs.Sliced) -> None:
-        """Call fragprune_slice."""
-
-    def unslice(
-        self, given: structs.Spacetime, by: structs.Sliced, to: structs.SpacetimeGrads
-    ) -> None:
-        """Call fragprune_unslice."""
+Way = Literal["slice", "unslice"]
+"""Forward, and backward."""
 
 
 @dataclass(frozen=True)
 class CpuKernels:
-    """Those of the compiled library."""
+    """fragprune_slice and fragprune_unslice of the compiled library."""
 
     library: binding.Library
     workspace: binding.Workspace
@@ -128,25 +113,17 @@ class CpuKernels:
         """An uninitialised float32 tensor of this shape."""
         return empty(self.workspace, *shape)
 
-    def slice(self, given: structs.Spacetime, to: structs.Sliced) -> None:
-        """Call fragprune_slice."""
-        self._call("fragprune_slice", given, to)
-
-    def unslice(
-        self, given: structs.Spacetime, by: structs.Sliced, to: structs.SpacetimeGrads
-    ) -> None:
-        """Call fragprune_unslice."""
-        self._call("fragprune_unslice", given, by, to)
-
-    def _call(self, function: str, *structs: ctypes.Structure) -> None:
+    def call(self, way: Way, *arguments: Any) -> None:
+        """Cut, or go back: inputs, what was cut or its gradients, and gradients to fill."""
         error = binding.Error()
-        status = getattr(self.library.calls, function)(*map(ctypes.byref, (*structs, error)))
+        passed = (each for each in (*arguments, error) if each is not None)
+        status = getattr(self.library.calls, f"fragprune_{way}")(*map(ctypes.byref, passed))
         expect_ok(status, error)
 
 
 @dataclass(frozen=True)
 class CudaKernels:
-    """Those of native/cuda/slice.cu."""
+    """fp_slice and fp_unslice of native/cuda/slice.cu."""
 
     device: Device
     where: torch.device
@@ -155,19 +132,15 @@ class CudaKernels:
         """An uninitialised float32 tensor of this shape on the device."""
         return torch.empty(shape, device=self.where)
 
-    def slice(self, given: structs.Spacetime, to: structs.Sliced) -> None:
-        """Launch fp_slice."""
-        self._launch("fp_slice", structs.Slicing(given=given, sliced=to))
+    def call(self, way: Way, given: structs.Spacetime, *others: Any) -> None:
+        """Cut, or go back."""
+        passed = structs.Slicing(given, *(each for each in others if each is not None))
+        blocks = blocks_of(given.count)
+        launch(self.device, self.where, "slice", structs.MACROS, f"fp_{way}", blocks, passed)
 
-    def unslice(
-        self, given: structs.Spacetime, by: structs.Sliced, to: structs.SpacetimeGrads
-    ) -> None:
-        """Launch fp_unslice."""
-        self._launch("fp_unslice", structs.Slicing(given=given, sliced=by, to=to))
 
-    def _launch(self, kernel: str, arguments: structs.Slicing) -> None:
-        blocks = blocks_of(arguments.given.count)
-        launch(self.device, self.where, "slice", structs.MACROS, kernel, blocks, arguments)
+SliceKernels = CpuKernels | CudaKernels
+"""The compiled functions that cut Gaussians, and the device where tensors must be."""
 
 
 @cache
@@ -291,7 +264,7 @@ class _Slice(torch.autograd.Function):
         }
         present = torch.empty(n, dtype=torch.bool, device=kernels.where)
         addresses = {name: address(output) for name, output in outputs.items()}
-        kernels.slice(cut.given(), structs.Sliced(present=address(present), **addresses))
+        kernels.call("slice", cut.given(), structs.Sliced(present=address(present), **addresses))
         wanted = {n for n, needs in zip(_NAMES, ctx.needs_input_grad[1:], strict=True) if needs}
         idle = [o for name, o in outputs.items() if o is not None and not wanted & _FELT_BY[name]]
         ctx.mark_non_differentiable(present, *idle)
@@ -308,7 +281,8 @@ class _Slice(torch.autograd.Function):
         by = [None if g is None else plain(g, cut.kernels.where) for g in upstream[:4]]
         wanted = [n for n, needs in zip(_NAMES, ctx.needs_input_grad[1:], strict=True) if needs]
         grads = {name: cut.kernels.empty(*cut.arrays[name].shape) for name in wanted}
-        cut.kernels.unslice(
+        cut.kernels.call(
+            "unslice",
             cut.given(),
             structs.Sliced(
                 present=address(ctx.present),

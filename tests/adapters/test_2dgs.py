@@ -102,7 +102,7 @@ def test_we_measure_the_picture_that_the_hosts_own_script_renders(mini, trained,
 
 def test_compare_draws_its_models_by_their_record(trained):
     summary, _, _ = trained
-    records.leave(summary.model_after, "run", {"photographs": photographs_of(summary)})
+    records.leave(summary.model_after, "run", {"photographs": photographs_of(summary).as_dict()})
     found = run_json("compare", summary.model_before, summary.model_after)
     assert found["b"]["fragments_per_pixel"] < found["a"]["fragments_per_pixel"]
 

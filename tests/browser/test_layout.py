@@ -14,7 +14,7 @@ from browser.viewing import write_page
 from cli.commands import run_json
 from finetune import tiny
 
-from fragprune_plugins.workbench.demo import page as demo_page
+from fragprune_plugins.workbench.demo import work as demo_page
 
 pytestmark = [pytest.mark.browser, pytest.mark.filterwarnings("ignore::DeprecationWarning")]
 

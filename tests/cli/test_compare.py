@@ -9,8 +9,8 @@ from finetune import tiny
 
 from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.figures import evaluate
-from fragprune_plugins.workbench.figures.drawing import rasterize
 from fragprune_plugins.workbench.figures.metrics import psnr
+from fragprune_plugins.workbench.figures.viewing import rasterize
 from fragprune_plugins.workbench.models.formats.ply import write_ply
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
 

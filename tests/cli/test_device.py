@@ -17,6 +17,7 @@ from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.plugins.loading import installed
 from fragprune_plugins.workbench.commands import opening
 from fragprune_plugins.workbench.commands.options import EngineOptions
+from fragprune_plugins.workbench.figures.recorded import Recorded
 from fragprune_plugins.workbench.models.formats.ply import write_ply
 from fragprune_plugins.workbench.run.work import measure_models
 
@@ -70,8 +71,9 @@ def test_what_was_learned_there_is_saved_here(scene, engine):
 
 def test_a_run_is_measured_there(scene, engine):
     data, path, _, _ = scene
-    photographs = {**Photographs(data).as_dict(), "models": [str(path)] * 2, "drawing": {}}
-    before, after = measure_models(photographs, EngineOptions(device="cuda"))
+    before, after = measure_models(
+        Recorded(Photographs(data), (path, path), filtered=True), EngineOptions(device="cuda")
+    )
     assert (before["device"], after["engine"]) == ("meta", "elsewhere")
 
 

@@ -19,7 +19,7 @@ from fragprune_plugins.injection import launch
 from fragprune_plugins.learning.schedule import USUAL_STOP
 from fragprune_plugins.testing import mutations
 from fragprune_plugins.workbench.finetune import trial
-from fragprune_plugins.workbench.run import looking
+from fragprune_plugins.workbench.run import work
 
 WORDS = ["--device", "cpu", "--iters", 6]
 
@@ -214,7 +214,7 @@ def test_a_model_that_knows_its_photographs_by_heart_is_told_and_learns_otherwis
     assert (asked["gaussians"], asked["keep"], asked["forgotten"]) == (whole, None, None)
 
 
-@pytest.mark.parametrize("where", [(trial, "forgotten"), (looking, "removal_error")])
+@pytest.mark.parametrize("where", [(trial, "forgotten"), (work, "removal_error")])
 def test_where_a_look_fails_stage_two_learns_as_asked(scene, tmp_path, monkeypatch, caplog, where):
     def fail(*_, **__):
         raise ModelFileError("out", "a stand-in", "something else", "Nothing.")

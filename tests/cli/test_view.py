@@ -11,7 +11,7 @@ from finetune import tiny
 
 from fragprune_plugins.files import records
 from fragprune_plugins.workbench.models.formats.ply import write_ply
-from fragprune_plugins.workbench.view import server as serving
+from fragprune_plugins.workbench.view import site as serving
 
 
 def test_a_folder_with_cameras_and_photographs(cut_scene, tmp_path):

@@ -18,7 +18,7 @@ from fragprune_plugins.files.atomic import (
     put,
     replacing,
 )
-from fragprune_plugins.workbench.models.written import writable_folder
+from fragprune_plugins.workbench.models.model import writable_folder
 
 
 def test_the_new_file_appears_whole_under_its_name(tmp_path):

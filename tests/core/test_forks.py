@@ -12,7 +12,7 @@ from fragprune_plugins.adapting import EngineError, HostCall, NotComparedError, 
 from fragprune_plugins.hosts.choosing import attempt, choose
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.plugins.loading import load_plugins
-from fragprune_plugins.workbench.check.verdict import judge
+from fragprune_plugins.workbench.check.work import judge
 
 
 def errors(repo):

@@ -14,8 +14,8 @@ from fragprune_plugins.learning.goals import Control, Fewer, Pressure
 from fragprune_plugins.learning.schedule import JointSchedule, Schedule, Settings, StepPlan
 from fragprune_plugins.learning.stage2 import Stage2, evenly, stored_thresholds
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.workbench.distributed.stage import SharedStage
 from fragprune_plugins.workbench.finetune.faster import FrameTarget
+from fragprune_plugins.workbench.finetune.processes import SharedStage
 from fragprune_plugins.workbench.goals import TIME_FOLLOWS, Faster
 
 OPACITIES = torch.linspace(0.2, 0.9, 5)

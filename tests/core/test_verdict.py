@@ -7,7 +7,7 @@ from fragprune_graphdeco.plain import read_plain
 from fragprune_plugins.hosts.choosing import attempt
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.plugins.loading import load_plugins
-from fragprune_plugins.workbench.check.verdict import judge
+from fragprune_plugins.workbench.check.work import judge
 
 MODEL = """
     def setup_functions(self):

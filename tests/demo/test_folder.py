@@ -6,7 +6,7 @@ import pytest
 from cli.commands import run
 
 from fragprune_plugins.errors import OutputError
-from fragprune_plugins.workbench.demo import demo, folder
+from fragprune_plugins.workbench.demo import folder, work
 
 
 def contents(path):
@@ -30,7 +30,7 @@ def made(tmp_path):
 
 
 def test_a_folder_with_our_names_is_not_ours(tmp_path, monkeypatch):
-    monkeypatch.setattr(demo, "make_scene", None)  # never called
+    monkeypatch.setattr(work, "make_scene", None)  # never called
     keep = tmp_path / "keep"
     (keep / "scene").mkdir(parents=True)
     write(keep / "model" / "precious.txt")

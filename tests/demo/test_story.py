@@ -11,15 +11,14 @@ import pytest
 from cli.commands import run_json
 
 from fragprune_plugins.workbench.demo import folder
-from fragprune_plugins.workbench.demo.demo import DemoSettings, host_command
-from fragprune_plugins.workbench.demo.page import BANNER
+from fragprune_plugins.workbench.demo.work import BANNER, DemoSettings, host_command
 from fragprune_plugins.workbench.figures.wording import outcome
 
 TINY = """
 import json, sys
 from pathlib import Path
 from fragprune_plugins.workbench.demo import folder
-from fragprune_plugins.workbench.demo.demo import DemoSettings, run_demo
+from fragprune_plugins.workbench.demo.work import DemoSettings, run_demo
 settings = DemoSettings(iterations=60, finetune=30, views=9, width=48, points=400)
 print(json.dumps(run_demo(Path(sys.argv[1]), settings)))
 """

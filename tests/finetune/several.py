@@ -20,6 +20,7 @@ from cli.commands import run as run_command
 from fragprune_plugins.errors import FragpruneError
 from fragprune_plugins.learning.goals import Control, Fewer, Portable
 from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.learning.stage2 import Stage2
 from fragprune_plugins.workbench.finetune import loop
 from fragprune_plugins.workbench.ranks import joined
 
@@ -134,14 +135,14 @@ def learn(size: int, work: Callable[[Any], Any]) -> list[Any]:
 
 def at_step(number: int, do: Callable[[], object]) -> None:
     """Do something when this process is in the midst of a step."""
-    begin = loop.Stage2.begin
+    begin = Stage2.begin
 
     def beginning(stage: Any, opacities: Any) -> Any:
         if stage.steps == number:
             do()
         return begin(stage, opacities)
 
-    loop.Stage2.begin = beginning  # type: ignore[method-assign]
+    Stage2.begin = beginning  # type: ignore[method-assign]
 
 
 def lose_nan(ranks: Any) -> None:

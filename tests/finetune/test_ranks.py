@@ -18,8 +18,7 @@ from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.goals import Control, Pressure
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.workbench import ranks as module
-from fragprune_plugins.workbench.distributed import processes
-from fragprune_plugins.workbench.finetune import loop
+from fragprune_plugins.workbench.finetune import loop, processes
 from fragprune_plugins.workbench.finetune.api import finetune
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
 from fragprune_plugins.workbench.goals import Faster

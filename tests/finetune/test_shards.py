@@ -15,11 +15,16 @@ from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import DivergedError, InputError, UsageError
 from fragprune_plugins.learning.goals import Portable
 from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.learning.stage2 import Stage2
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs, Splats
-from fragprune_plugins.workbench.distributed.processes import Shards, part_of, whole_of
-from fragprune_plugins.workbench.distributed.sharded import ShardedEngine, reaching
-from fragprune_plugins.workbench.finetune import loop
+from fragprune_plugins.workbench.distributed import (
+    ShardedEngine,
+    Shards,
+    part_of,
+    reaching,
+    whole_of,
+)
 from fragprune_plugins.workbench.finetune.api import finetune
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
 from fragprune_plugins.workbench.ranks import Ranks
@@ -272,14 +277,14 @@ def test_an_interrupted_fine_tuning_goes_on_to_the_same_bits(model, dataset, tmp
         return Checkpoints(tmp_path / "kept", None, 5)
 
     def stopped(ranks):
-        real = loop.Stage2.end
+        real = Stage2.end
 
         def end(stage):
             real(stage)
             if stage.steps == 7:
                 raise DivergedError("step 7", "a stop", "none", "Go on.")
 
-        loop.Stage2.end = end
+        Stage2.end = end
         return learned(model, dataset, settings, ranks, checkpoints())
 
     assert [each.code for each in learn(2, stopped)] == ["not-finite"] * 2

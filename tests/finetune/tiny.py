@@ -18,6 +18,7 @@ from fragprune_plugins import rasterize
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs
+from fragprune_plugins.workbench.figures import evaluate
 from fragprune_plugins.workbench.finetune import faster, loop
 from fragprune_plugins.workbench.models.formats.ply import write_ply
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Photograph
@@ -242,5 +243,5 @@ def exact_clock(patch: pytest.MonkeyPatch, base: float = 0.02) -> None:
         outputs = work()
         return outputs, base + 2e-3 * float(outputs.fragments_per_pixel)
 
-    patch.setattr(faster, "timed", timed)
+    patch.setattr(evaluate, "timed", timed)
     patch.setattr(faster, "_SECONDS", 0.0)

@@ -8,7 +8,7 @@ import pytest
 from fragprune_plugins.engines.cuda import kernels
 from fragprune_plugins.engines.cuda.frame import MACROS, unblend_macros
 from fragprune_plugins.slicing import structs
-from fragprune_plugins.workbench.doctor.compiling import VARIANTS, resources
+from fragprune_plugins.workbench.doctor.work import VARIANTS, resources
 
 ARCHITECTURES = (
     90,

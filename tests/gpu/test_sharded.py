@@ -9,8 +9,7 @@ from finetune.several import learn
 from fragprune_plugins.engines.cuda.engine import CudaEngine
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs
-from fragprune_plugins.workbench.distributed.processes import part_of
-from fragprune_plugins.workbench.distributed.sharded import ShardedEngine
+from fragprune_plugins.workbench.distributed import ShardedEngine, part_of
 from fragprune_plugins.workbench.ranks import Ranks
 
 LEARNED = ("xyz", "f_rest", "opacity", "scaling")

@@ -21,7 +21,7 @@ from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.hooks import select_adapter, thresholds_for
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import Plugins
-from fragprune_plugins.workbench.check.verdict import judge, models_of
+from fragprune_plugins.workbench.check.work import judge, models_of
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 HOOKS = [name for name in vars(hookspecs) if name.startswith("fragprune_")]

@@ -18,7 +18,7 @@ from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.hooks import engine_for, schedule_for, select_adapter, thresholds_for
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import Plugins
-from fragprune_plugins.workbench.check.verdict import models_of
+from fragprune_plugins.workbench.check.work import models_of
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 pytestmark = pytest.mark.usefixtures("single_thread")

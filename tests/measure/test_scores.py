@@ -11,7 +11,7 @@ from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import InputError
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs
-from fragprune_plugins.workbench.pruning import scores
+from fragprune_plugins.workbench import pruning as scores
 
 COUNT = 20
 VIEWS = [

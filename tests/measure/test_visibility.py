@@ -13,7 +13,7 @@ from fragprune_plugins.constants import ALPHA_MIN
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import InputError
 from fragprune_plugins.types import RasterInputs, Splats
-from fragprune_plugins.workbench.pruning.visibility import visible
+from fragprune_plugins.workbench.pruning import visible
 
 VIEWS = [camera.view() for camera in tiny.cameras()]
 

@@ -96,7 +96,7 @@ def check_measured(
     candidate = Candidate(read(summary.model_after), summary.drawing)
     (shot,) = load_dataset(photographs).test
     with torch.no_grad():
-        image = rasterize(candidate.inputs(shot.view, candidate.model.splats()), values).image
+        image = rasterize(candidate.inputs(shot.view), values).image
     pixels = (image.clamp(0, 1) * 255 + 0.5).byte().permute(1, 2, 0).numpy()
     theirs = np.asarray(Image.open(picture))
     assert np.abs(pixels.astype(int) - theirs).max() <= 1  # a camera's float32, rounded

@@ -8,7 +8,7 @@ from threading import Thread
 import pytest
 
 from fragprune_plugins.errors import OutputError
-from fragprune_plugins.workbench.view import server as serving
+from fragprune_plugins.workbench.view import site as serving
 
 SITE = {"index.html": b"<p>here", "model-0.splats": bytes(range(7)), "photographs/0000.jpg": b"jpg"}
 

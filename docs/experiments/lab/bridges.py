@@ -27,8 +27,8 @@ from PIL import Image
 
 from fragprune_plugins import View, load, load_cameras, rasterize
 from fragprune_plugins.types import RasterInputs
-from fragprune_plugins.workbench.bench.machine import describe_machine
 from fragprune_plugins.workbench.bench.scene import make_view
+from fragprune_plugins.workbench.bench.timing import describe_machine
 from fragprune_plugins.workbench.figures.viewing import overview
 
 SIZE = (1280, 720)

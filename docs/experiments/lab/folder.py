@@ -21,7 +21,7 @@ from fragprune_plugins.errors import RecordError
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.reading import MEBIBYTE, Door
 from fragprune_plugins.files.records import strict
-from fragprune_plugins.workbench.models.written import writable_folder
+from fragprune_plugins.workbench.models.model import writable_folder
 
 RESULTS = (".md", ".csv", ".png")
 """Endings of the files that results are written to, after the experiment's name."""

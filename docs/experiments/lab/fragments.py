@@ -93,16 +93,16 @@ def weigh(inputs: RasterInputs, thresholds: Tensor | None, tiles: int) -> Tensor
 @torch.no_grad()
 def _count(column: Candidate, shots: Sequence[Shot], engine: Engine, bar: Any) -> dict[str, Any]:
     """Everything that the table and the plot show of one model, as plain values."""
-    splats = column.model.splats()
+    splats = column.splats
     owned = torch.zeros_like(splats.opacities)
     found: dict[str, Any] = {"owned": 0, "radius": 0, "weight": 0, "light": 0}
     pixels, maps = 0, []
     for shot in shots:
-        outputs = column.draw(engine, shot.view, splats, counts=True)
+        outputs = column.draw(engine, shot.view, counts=True)
         mine, seen = outputs.fragments_per_gaussian, outputs.fragments
         assert mine is not None
         assert seen is not None
-        inputs = column.inputs(shot.view, splats)
+        inputs = column.inputs(shot.view)
         weights = weigh(inputs, column.thresholds(inputs), _TILES)
         owned += mine
         pixels += seen.numel()

@@ -26,12 +26,11 @@ from browser.viewing import decibels, engine_frame, frame, hold, viewing, write_
 
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.types import View
-from fragprune_plugins.workbench.bench.machine import describe_machine
 from fragprune_plugins.workbench.bench.scene import make_scene, make_view
+from fragprune_plugins.workbench.bench.timing import describe_machine
 from fragprune_plugins.workbench.figures.viewing import overview
 from fragprune_plugins.workbench.models.model import load
-from fragprune_plugins.workbench.view.server import address, open_server
-from fragprune_plugins.workbench.view.site import Layer, make_site
+from fragprune_plugins.workbench.view.site import Layer, address, make_site, open_server
 
 SIZE = (1280, 720)
 

@@ -21,7 +21,7 @@ from fragprune_plugins.workbench.figures.evaluate import Candidate, frame_times,
 from fragprune_plugins.workbench.finetune.api import FinetuneResult, finetune
 from fragprune_plugins.workbench.finetune.resuming import described
 from fragprune_plugins.workbench.models import model as models
-from fragprune_plugins.workbench.pruning.scores import best
+from fragprune_plugins.workbench.pruning import best
 from fragprune_plugins.workbench.scenes.dataset import Dataset, load_photographs
 from lab.catalogue import Arm, Experiment, Pruning
 from lab.folder import Folder

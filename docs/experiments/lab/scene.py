@@ -13,7 +13,7 @@ from fragprune_plugins.engines import Engine
 from fragprune_plugins.files import records
 from fragprune_plugins.files.atomic import digest
 from fragprune_plugins.hosts.photographs import Photographs
-from fragprune_plugins.workbench.bench.machine import describe_machine
+from fragprune_plugins.workbench.bench.timing import describe_machine
 from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.scenes.dataset import Dataset

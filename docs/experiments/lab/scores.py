@@ -11,7 +11,7 @@ from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.fragments import fragments
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.types import RasterInputs, RasterOutputs, View
-from fragprune_plugins.workbench.pruning.scores import Score, removal_error
+from fragprune_plugins.workbench.pruning import Score, removal_error
 
 VOLUME_POWER = 0.1
 """LightGaussian's exponent of a Gaussian's volume (``v_pow``)."""

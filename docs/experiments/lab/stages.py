@@ -102,7 +102,6 @@ def _time(
     columns: Mapping[str, Candidate], views: Sequence[View], engine: Engine, repeats: int
 ) -> dict[str, Any]:
     """Milliseconds by column, round and stage, means over views; a first round is left out."""
-    drawn = {label: column.model.splats() for label, column in columns.items()}
     rounds: dict[str, list[dict[str, float]]] = {label: [] for label in columns}
     fragments = dict.fromkeys(columns, 0.0)
     order = list(columns)
@@ -111,7 +110,7 @@ def _time(
         for view in views:
             order.reverse()  # none is always the one that finds a cold cache
             for label in order:
-                inputs = columns[label].inputs(view, drawn[label])
+                inputs = columns[label].inputs(view)
                 thresholds = columns[label].thresholds(inputs)
                 frame = partial(engine.rasterize, inputs, thresholds)
                 outputs, spent = timed(frame, inputs.splats.device)

@@ -26,7 +26,7 @@ from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.fragments import fragments
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.schedule import USUAL_STOP
-from fragprune_plugins.types import Splats, View, one_line
+from fragprune_plugins.types import View, one_line
 from fragprune_plugins.workbench.figures.evaluate import Candidate, frame_times
 from fragprune_plugins.workbench.figures.extents import (
     CUTS,
@@ -243,8 +243,9 @@ class _Survey:
     """An audit under way."""
 
     def __init__(self, model: Model, engine: Engine) -> None:
-        self._model, self._engine, self._splats = model, engine, model.splats()
-        self.candidates = _candidates(model, self._splats)
+        self._model, self._engine = model, engine
+        self.candidates = _candidates(model)
+        self._itself = self.candidates[AS_IT_IS]
         self.shown: list[Shown] = []
         self._rows: dict[str, list[dict[str, Any]]] = {name: [] for name in self.candidates}
         self._asked: dict[str, list[float]] = {}
@@ -258,9 +259,9 @@ class _Survey:
         Args:
             shown: pictures show it, and frames of it are timed.
         """
-        engine, splats, itself = self._engine, self._splats, None
+        engine, opacities, itself = self._engine, self._itself.splats.opacities, None
         for label, candidate in self.candidates.items():
-            out = candidate.draw(engine, view, splats, counts=itself is None)
+            out = candidate.draw(engine, view, counts=itself is None)
             itself = out if itself is None else itself
             error = (out.image.clamp(0, 1) - itself.image.clamp(0, 1)).square().mean()
             row = {
@@ -271,15 +272,15 @@ class _Survey:
             self._rows[label].append(row)
         assert itself is not None
         self._radii = itself.radii
-        inputs = self.candidates[AS_IT_IS].inputs(view, splats)
-        squared = SQRT8.squared(splats.opacities)
+        inputs = self._itself.inputs(view)
+        squared = SQRT8.squared(opacities)
         ellipses = covered(engine, replace(inputs, counts=True), squared)
         self._overdraw.append(float(ellipses.fragments_per_pixel))
         for viewer in VIEWERS:
             self._asked.setdefault(viewer.names, []).append(shaded(engine, inputs, viewer))
-        cut = self.candidates[AS_IT_IS].thresholds(inputs)
+        cut = self._itself.thresholds(inputs)
         if cut is not None:
-            reach = honouring(cut, splats.opacities)
+            reach = honouring(cut, opacities)
             quads = 4 / math.pi * float(covered(engine, inputs, reach).fragments_per_pixel)
             self._asked.setdefault(HONOURING, []).append(quads)
         if shown:
@@ -289,12 +290,11 @@ class _Survey:
 
     def weigh(self, view: View, tiles: int) -> Iterator[None]:
         """Weigh the fragments of the view that was drawn last, one by one; some tiles, in turns."""
-        opacities, radii = self._splats.opacities, self._radii
-        candidate = self.candidates[AS_IT_IS]
-        inputs = candidate.inputs(view, self._splats)
+        opacities, radii = self._itself.splats.opacities, self._radii
+        inputs = self._itself.inputs(view)
         kinds = 3 * torch.bucketize(opacities, opacities.new_tensor(OPACITIES))
         kinds += torch.bucketize(radii, radii.new_tensor(RADII))
-        for tile in fragments(inputs, candidate.thresholds(inputs), tiles):
+        for tile in fragments(inputs, self._itself.thresholds(inputs), tiles):
             if len(tile.rows):
                 self._idle.add(kinds[tile.rows], weigh(tile, view.background))
             yield
@@ -315,7 +315,7 @@ class _Survey:
             **{name: cuts[0][name] for name in same},
             "frame_size": _sizes(self.shown),
             "engine": self._engine.name,
-            "device": str(self._splats.device),
+            "device": str(self._model.device),
             "idle": self._idle.as_dict(),
             "cuts": cuts,
             "viewers": _viewers(self._asked),
@@ -338,11 +338,12 @@ def _amid(count: int) -> list[int]:
 HONOURING = "a viewer that knows its cutoffs"
 
 
-def _candidates(model: Model, splats: Splats) -> dict[str, Candidate]:
+def _candidates(model: Model) -> dict[str, Candidate]:
     """The model as it is, first, and with every cut on top."""
-    found, own = {AS_IT_IS: Candidate(model)}, model.falloff
+    itself, own = Candidate(model), model.falloff
+    found = {AS_IT_IS: itself}
     for cut in CUTS:
-        thresholds = cut.thresholds(splats.opacities)
+        thresholds = cut.thresholds(itself.splats.opacities)
         thresholds = thresholds if own is None else torch.maximum(own, thresholds)
         found[cut.name] = Candidate(model, cut=thresholds)
     if model.stop is None:

@@ -64,7 +64,8 @@ def draw(folder: Path, shown: Sequence[Shown]) -> dict[str, Any]:
 
 def sentence(figures: Mapping[str, Any]) -> str:
     """One line to quote."""
-    idle, cameras = figures["idle"], figures["cameras"]
+    idle, views = figures["idle"], "view" if figures["views"] == 1 else "views"
+    cameras = _FROM[figures["cameras"]["kind"]].format(views)
     quads = figures["viewers"][0]["shaded_per_pixel"]
     return (
         f"{figures['gaussians']:,} Gaussians draw {figures['fragments_per_pixel']:.1f} fragments "
@@ -73,7 +74,7 @@ def sentence(figures: Mapping[str, Any]) -> str:
         f"viewer of fixed √8 sigma quads shades {quads:.1f} pixels per pixel. "
         f"{idle['together']:.0%} of the fragments can be left out together, and no pixel "
         f"changes by half an 8-bit level "
-        f"({figures['views']} {_from(cameras['kind'], figures['views'])})."
+        f"({figures['views']} {cameras})."
     )
 
 
@@ -223,10 +224,6 @@ def _kinds(idle: Mapping[str, Any]) -> page.Table:
         for name, *both in zip(opacities, shares, spared, strict=True)
     ]
     return page.Table(["Gaussians", *(f"radius {name}" for name in radii)], rows, _KINDS_SAID)
-
-
-def _from(kind: str, count: int) -> str:
-    return _FROM[kind].format("view" if count == 1 else "views")
 
 
 def _part(some: float, every: float) -> str:

@@ -17,8 +17,7 @@ from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import cameras_of, open_engine
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.figures.wording import nothing_drawn
-from fragprune_plugins.workbench.models.model import load
-from fragprune_plugins.workbench.models.written import writable_folder
+from fragprune_plugins.workbench.models.model import load, writable_folder
 from fragprune_plugins.workbench.scenes.cameras import divided, load_cameras, load_scene_cameras
 
 PAGE, FIGURES = "audit.html", "audit.json"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import platform
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -12,8 +14,9 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.engines import Engine
+from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View, one_line
-from fragprune_plugins.workbench.figures.clock import synchronize, timed
+from fragprune_plugins.workbench.figures.clock import standard_error, synchronize, timed
 
 Pass = Literal["forward", "forward_backward"]
 
@@ -109,7 +112,7 @@ def measure(
                 "evaluated_per_pixel": last[index].evaluated_per_pixel,
                 "ms_median": median,
                 "ms_min": min(times[index]),
-                "ms_se": _standard_error(times[index]),
+                "ms_se": standard_error(times[index]),
                 "ns_per_fragment": 1e6 * median / fragments if fragments else None,
                 "stages": {
                     name: statistics.median(part[name] for part in stages[index])
@@ -130,19 +133,19 @@ def translation(results: Sequence[dict[str, Any]], engine: str) -> dict[str, dic
         truncated, and ``share``, time over fragments.
     """
     found: dict[str, dict[str, float]] = {}
-    forward = [r for r in results if r["engine"] == engine and r["pass"] == "forward"]
-    for plain in forward:
-        for cut in forward:
-            same = all(plain[k] == cut[k] for k in ("scene", "width", "height", "gaussians"))
-            drawn = cut["fragments_per_pixel"] > 0
-            if same and drawn and cut["truncated"] and not plain["truncated"]:
-                time_ratio = plain["ms_median"] / cut["ms_median"]
-                fragments = plain["fragments_per_pixel"] / cut["fragments_per_pixel"]
-                found[f"{plain['scene']} {plain['width']}x{plain['height']}"] = {
-                    "fragments": fragments,
-                    "time": time_ratio,
-                    "share": time_ratio / fragments,
-                }
+    rows: dict[bool, dict[Any, dict[str, Any]]] = {True: {}, False: {}}
+    for row in results:
+        if row["engine"] == engine and row["pass"] == "forward":
+            work = tuple(row[key] for key in ("scene", "width", "height", "gaussians"))
+            rows[row["truncated"]][work] = row
+    for work, plain in rows[False].items():
+        cut = rows[True].get(work)
+        if cut is not None and cut["fragments_per_pixel"] > 0:
+            time_ratio = plain["ms_median"] / cut["ms_median"]
+            fragments = plain["fragments_per_pixel"] / cut["fragments_per_pixel"]
+            share = time_ratio / fragments
+            name = "{scene} {width}x{height}".format(**plain)
+            found[name] = {"fragments": fragments, "time": time_ratio, "share": share}
     return found
 
 
@@ -196,10 +199,6 @@ def _prepare(case: Case, engine: Engine) -> Callable[[], RasterOutputs]:
     return draw_and_differentiate
 
 
-def _standard_error(values: Sequence[float]) -> float:
-    return statistics.stdev(values) / len(values) ** 0.5 if len(values) > 1 else 0.0
-
-
 def _with_peak(
     job: Callable[[], RasterOutputs], device: torch.device
 ) -> tuple[RasterOutputs, float | None]:
@@ -224,3 +223,37 @@ def _status(field: str) -> float:
         if line.startswith(field):
             return float(line.split()[1]) / 1024
     raise OSError(f"no {field} in /proc/self/status")
+
+
+def describe_machine(device: torch.device | str = "cpu") -> dict[str, Any]:
+    """The processor, and the versions that decide about speed.
+
+    Returns:
+        processor, cores, platform, torch, native (build of the cpu engine, or None), gpu (name of
+        the device, None for the CPU).
+    """
+    device = torch.device(device)
+    native = binding.chosen()
+    return {
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "platform": platform.platform(),
+        "torch": torch.__version__,
+        "native": native.build if isinstance(native, binding.Library) else None,
+        "gpu": torch.cuda.get_device_name(device) if device.type == "cuda" else None,
+    }
+
+
+def load_average() -> float | None:
+    """Processes that run or wait, mean over a minute; None where the system does not tell."""
+    return os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+
+
+def _processor() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,16 @@ from torch import Tensor
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.plugins.hooks import thresholds_for
 from fragprune_plugins.types import RasterInputs, Splats, View
-from fragprune_plugins.workbench.bench.machine import describe_machine, load_average
 from fragprune_plugins.workbench.bench.scene import make_scene, make_view
-from fragprune_plugins.workbench.bench.timing import Case, Pass, measure, scaling, translation
+from fragprune_plugins.workbench.bench.timing import (
+    Case,
+    Pass,
+    describe_machine,
+    load_average,
+    measure,
+    scaling,
+    translation,
+)
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import cameras_of, open_engine
 from fragprune_plugins.workbench.commands.options import EngineOptions
@@ -61,7 +69,7 @@ def bench(
             Case(name, view, splats, kind, cut, rules),
         )
     ]
-    results = measure(cases, [rasterizer], repeats=REPEATS, say=_say)
+    results = measure(cases, [rasterizer], repeats=REPEATS, say=partial(click.echo, err=True))
     machine = describe_machine(device) | {"load_before": before, "load_after": load_average()}
     saved = translation(results, rasterizer.name)
     one_scene = len({row["scene"] for row in results}) == 1
@@ -75,10 +83,6 @@ def bench(
         "machine": machine,
     }
     return Report(data, _table(data))
-
-
-def _say(text: str) -> None:
-    click.echo(text, err=True)
 
 
 def _generated(gaussians: tuple[int, ...], sizes: list[Size], device: torch.device) -> list[Scene]:
@@ -143,17 +147,11 @@ def _table(data: dict[str, Any]) -> str:
             f"a fragment costs {prices['least']:.2f} to {prices['most']:.2f} ns: "
             f"{prices['ratio']:.1f}x between the cheapest and the dearest scene and size"
         )
-    first = results[0]
+    first, loads = results[0], "load unknown on this system"
+    if machine["load_before"] is not None:
+        loads = f"load {machine['load_before']:.1f} to {machine['load_after']:.1f}"
     lines.append(
         f"{first['engine']} engine ({machine['native']}) on {machine['gpu'] or first['device']}, "
-        f"{first['threads']} threads on {machine['processor']}; "
-        f"{_busy(machine)}"
+        f"{first['threads']} threads on {machine['processor']}; {loads}"
     )
     return "\n".join(lines)
-
-
-def _busy(loads: dict[str, Any]) -> str:
-    """The machine's load before and after, as words."""
-    if loads["load_before"] is None:
-        return "load unknown on this system"
-    return f"load {loads['load_before']:.1f} to {loads['load_after']:.1f}"

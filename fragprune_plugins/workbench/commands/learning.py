@@ -1,15 +1,16 @@
-"""The options of learning, for ``run`` and ``finetune``."""
+"""The options of learning, for ``run`` and ``finetune``, on the command line or in a file."""
 
 from __future__ import annotations
 
-import contextlib
-import functools
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any, get_args
 
 import click
 
 from fragprune_plugins.errors import UsageError
+from fragprune_plugins.files.reading import MEBIBYTE, Door
 from fragprune_plugins.learning.goals import Control, Fewer, Goal, Portable, Pressure
 from fragprune_plugins.learning.pressure import (
     ELASTICITY,
@@ -25,9 +26,14 @@ from fragprune_plugins.learning.schedule import (
     steps_of,
 )
 from fragprune_plugins.types import Rim
-from fragprune_plugins.workbench.commands.options import Number, together
+from fragprune_plugins.workbench.commands.options import FILE, Function, Number, bundled
 from fragprune_plugins.workbench.commands.rules import Alone, apart
 from fragprune_plugins.workbench.goals import AtMost, Faster
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 
 class _Stop(click.ParamType[float | str | None]):
@@ -147,11 +153,10 @@ _OF_FINETUNE = (
 """Goals that need a model of before to time frames against, or several trainings."""
 
 
-def learning_options(*, every_goal: bool) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Add the options of learning to a command.
+def learning_options(*, every_goal: bool) -> Callable[[Function], Function]:
+    """The options of learning, which a command gets as ``settings``.
 
-    The command gets their values, and its own ``seed``, ``itself`` and ``views_per_step`` if it has
-    them, as ``settings``.
+    Its own ``seed``, ``itself`` and ``views_per_step``, if it has them, are part of these.
 
     Args:
         every_goal: offer also goals that a host's training cannot meet.
@@ -160,54 +165,24 @@ def learning_options(*, every_goal: bool) -> Callable[[Callable[..., Any]], Call
         UsageError: a value is out of range.
     """
 
-    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        @functools.wraps(function)
-        def with_settings(
-            *args: Any,
-            iters: int | None,
-            quick: bool,
-            train: Any,
-            pressure: float | None,
-            target_speedup: float | None,
-            portable: bool,
-            stop: Any,
-            rim: Rim | None,
-            dropout: float | None,
-            control: bool,
-            target_time: float | None = None,
-            max_drop: float | None = None,
-            **kwargs: Any,
-        ) -> Any:
-            itself = kwargs.get("itself", False)
-            default = QUICK_ITERATIONS if quick or itself else FINETUNE_ITERATIONS
-            views = kwargs.pop("views_per_step", 1)
-            with _spelled():
-                settings = Settings(
-                    iterations=steps_of(default, views) if iters is None else iters,
-                    train=train,
-                    goal=_goal(pressure, target_speedup, target_time, max_drop, portable, control),
-                    itself=itself,
-                    stop=stop,
-                    rim=rim,
-                    dropout=dropout,
-                    seed=kwargs.get("seed", 0),
-                    views_per_step=views,
-                )
-            return function(*args, settings=settings, **kwargs)
-
-        options = _OPTIONS + _OF_FINETUNE if every_goal else _OPTIONS
-        decorated: Callable[..., Any] = together(*options)(with_settings)
-        return decorated
-
-    return decorate
+    options = _OPTIONS + _OF_FINETUNE if every_goal else _OPTIONS
+    return bundled(lambda given: {"settings": _settings(given)}, *options)
 
 
-@contextlib.contextmanager
-def _spelled() -> Iterator[None]:
-    """Name the options whose values are refused."""
+def _settings(given: dict[str, Any]) -> Settings:
+    itself, views = given.get("itself", False), given.pop("views_per_step", 1)
+    iters, quick = given.pop("iters"), given.pop("quick")
+    default = QUICK_ITERATIONS if quick or itself else FINETUNE_ITERATIONS
     try:
-        yield
-    except UsageError as error:
+        return Settings(
+            iterations=steps_of(default, views) if iters is None else iters,
+            goal=_goal(given),
+            itself=itself,
+            seed=given.get("seed", 0),
+            views_per_step=views,
+            **{name: given.pop(name) for name in ("train", "stop", "rim", "dropout")},
+        )
+    except UsageError as error:  # name the option whose value is refused
         where = _SPELLED.get(error.where, error.where)
         raise UsageError(where, error.found, error.expected, error.remedy) from error
 
@@ -224,24 +199,73 @@ _SPELLED = {
 """Options by the names that errors give them."""
 
 
-def _goal(
-    pressure: float | None,
-    target_speedup: float | None,
-    target_time: float | None,
-    max_drop: float | None,
-    portable: bool,
-    control: bool,
-) -> Goal:
+def _goal(given: dict[str, Any]) -> Goal:
     """The one goal that options name; ``LEARNING_APART`` sees to it that they name no two."""
-    numbers: tuple[tuple[Any, float | None], ...] = (
-        (Fewer, target_speedup),
-        (Faster, target_time),
-        (AtMost, max_drop),
-    )
-    for kind, number in numbers:
-        if number is not None:
-            goal: Goal = kind(number)
-            return goal
+    pressure, portable, control = map(given.pop, ("pressure", "portable", "control"))
+    kinds: dict[str, Any] = {"target_speedup": Fewer, "target_time": Faster, "max_drop": AtMost}
+    numbers = {name: given.pop(name, None) for name in kinds}
+    goals: list[Goal] = [kinds[k](number) for k, number in numbers.items() if number is not None]
+    if goals:
+        return goals[0]
     if control:
         return Control()
     return Portable(pressure) if portable else Pressure(pressure)
+
+
+def _read_config(ctx: click.Context, param: click.Parameter, value: Path | None) -> Path | None:
+    """Make a TOML file's values the defaults of the command's options."""
+    if value is None:
+        return None
+    remedy = "Write one option a line, such as target-speedup = 2."
+    door = Door(UsageError, "not readable as TOML", "a TOML file", remedy, limit=MEBIBYTE)
+    try:
+        with door.reading(value) as reading:
+            values = tomllib.loads(reading.text())
+    except UsageError as error:
+        raise click.BadParameter(str(error), ctx, param) from error
+    options = {
+        word.lstrip("-"): each
+        for each in ctx.command.params
+        if isinstance(each, click.Option) and each is not param
+        for word in each.opts
+        if word.startswith("--")
+    }
+    names: dict[str, Any] = {}
+    for key, setting in values.items():
+        word = key.replace("_", "-")
+        if word not in options:
+            raise click.BadParameter(
+                f"{value}: {key!r} is no option of {ctx.command_path}.", ctx, param
+            )
+        try:
+            names[str(options[word].name)] = _as_words(options[word], setting)
+        except ValueError as error:
+            raise click.BadParameter(f"{value}: {key}: {error}", ctx, param) from error
+    ctx.default_map = {**(ctx.default_map or {}), **names}
+    return value
+
+
+def _as_words(option: click.Option, setting: Any) -> Any:
+    """What a line would say in place of a TOML value, so that both are read alike."""
+    if setting is True and isinstance(option.flag_value, str):  # its value may be left out
+        return option.flag_value
+    if isinstance(setting, bool) != option.is_flag or isinstance(setting, list) != option.multiple:
+        kind = "true or false" if option.is_flag else "a list" if option.multiple else "one value"
+        raise ValueError(f"{setting!r:.80}, where {kind} belongs")
+    if option.is_flag:
+        return setting
+    words = setting if option.multiple else [setting]
+    if not all(isinstance(word, str | int | float) and "\0" not in str(word) for word in words):
+        raise ValueError(f"{setting!r:.80}, where text or a number belongs")
+    return [str(word) for word in words] if option.multiple else str(setting)
+
+
+config_option = click.option(
+    "--config",
+    type=FILE,
+    is_eager=True,
+    expose_value=False,
+    callback=_read_config,
+    help="TOML file with options of this command, such as target-speedup = 2; the command "
+    "line takes precedence.",
+)

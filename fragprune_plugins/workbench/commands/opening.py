@@ -21,8 +21,7 @@ from fragprune_plugins.workbench.figures.wording import ITSELF
 from fragprune_plugins.workbench.ranks import launched, local_rank
 from fragprune_plugins.workbench.scenes.cameras import divided, load_cameras, load_scene_cameras
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
-from fragprune_plugins.workbench.scenes.generated import around
-from fragprune_plugins.workbench.scenes.itself import own_pictures
+from fragprune_plugins.workbench.scenes.generated import around, own_pictures
 from fragprune_plugins.workbench.scenes.output import (
     ARGUMENTS,
     CAMERAS,
@@ -108,37 +107,35 @@ def chosen(dataset: Dataset, views: str) -> Sequence[Shot]:
     }[views]
 
 
-def pictures_of(
-    model: Model, scene: SceneOptions, cameras: Path | None, engine: Engine, *, seed: int = 0
-) -> Dataset:
-    """A model's own pictures from the cameras that options name; all around it without any.
-
-    Raises:
-        DatasetError: the cameras cannot be read.
-    """
-    held_out = None
-    if scene.data is not None:
-        views, test = load_scene_cameras(scene.data, white_background=scene.white_background)
-        held_out = divided(test, scene.resolution)
-    elif cameras is not None:
-        views = load_cameras(cameras, white_background=scene.white_background)
-    else:
-        background = torch.full((3,), float(scene.white_background))
-        views = around(model, background=background, seed=seed)
-    return own_pictures(model, divided(views, scene.resolution), held_out, engine=engine, seed=seed)
-
-
 @dataclass(frozen=True)
 class OwnCameras:
-    """The cameras of a model's own pictures, and the seed of what is generated."""
+    """The cameras of a model's own pictures: those that options name; all around it without any.
+
+    Attributes:
+        seed: of what is generated.
+    """
 
     scene: SceneOptions
     cameras: Path | None
     seed: int = 0
 
     def pictures(self, model: Model, engine: Engine) -> Dataset:
-        """A model's own pictures from these cameras; see ``pictures_of``."""
-        return pictures_of(model, self.scene, self.cameras, engine, seed=self.seed)
+        """A model's own pictures from these cameras.
+
+        Raises:
+            DatasetError: the cameras cannot be read.
+        """
+        scene, seed, held_out = self.scene, self.seed, None
+        if scene.data is not None:
+            views, test = load_scene_cameras(scene.data, white_background=scene.white_background)
+            held_out = divided(test, scene.resolution)
+        elif self.cameras is not None:
+            views = load_cameras(self.cameras, white_background=scene.white_background)
+        else:
+            background = torch.full((3,), float(scene.white_background))
+            views = around(model, background=background, seed=seed)
+        views = divided(views, scene.resolution)
+        return own_pictures(model, views, held_out, engine=engine, seed=seed)
 
 
 def own_cameras(record: records.Record, scene: SceneOptions | None = None) -> OwnCameras | None:

@@ -89,11 +89,26 @@ class ModelFile(click.Path):
 MODEL = ModelFile()
 
 
-def together(*options: Callable[[Function], Function]) -> Callable[[Function], Function]:
-    """Several options as one decorator; --help shows them in this order."""
+Option = Callable[[Any], Any]
+"""What ``click.option`` gives."""
+
+
+def bundled(
+    gather: Callable[[dict[str, Any]], dict[str, Any]], *options: Option
+) -> Callable[[Function], Function]:
+    """Several options as one decorator; --help shows them in this order.
+
+    Args:
+        gather: takes out of the command's arguments those of the options, and returns what the
+            command gets in their place.
+    """
 
     def decorate(function: Function) -> Function:
-        return functools.reduce(lambda f, option: option(f), reversed(options), function)
+        @functools.wraps(function)
+        def gathered(*args: Any, **kwargs: Any) -> Any:
+            return function(*args, **gather(kwargs), **kwargs)
+
+        return functools.reduce(lambda f, option: option(f), reversed(options), gathered)  # type: ignore[return-value]
 
     return decorate
 
@@ -115,38 +130,32 @@ def engine_options(
     """The options of ``EngineOptions``, which a command gets as ``engine``."""
     names = "auto (the fastest that runs here), reference, cpu, cuda, or a plugin's engine."
 
-    def decorate(function: Function) -> Function:
-        @functools.wraps(function)
-        def with_engine(
-            *args: Any, engine: str, device: str, threads: int | None, **kwargs: Any
-        ) -> Any:
-            return function(*args, engine=EngineOptions(engine, device, threads), **kwargs)
+    def gather(given: dict[str, Any]) -> dict[str, Any]:
+        return {"engine": EngineOptions(*map(given.pop, ("engine", "device", "threads")))}
 
-        options = together(
-            click.option(
-                "--engine",
-                metavar="NAME",
-                default="auto",
-                show_default=True,
-                help=f"{what}: {names}",
-            ),
-            click.option(
-                "--device",
-                metavar="auto|cpu|cuda[:N]",
-                callback=_device,
-                default=default,
-                show_default=True,
-                help=device,
-            ),
-            click.option(
-                "--threads",
-                type=click.IntRange(min=1),
-                help="Number of CPU threads; default: all cores.",
-            ),
-        )
-        return options(with_engine)  # type: ignore[return-value]
-
-    return decorate
+    return bundled(
+        gather,
+        click.option(
+            "--engine",
+            metavar="NAME",
+            default="auto",
+            show_default=True,
+            help=f"{what}: {names}",
+        ),
+        click.option(
+            "--device",
+            metavar="auto|cpu|cuda[:N]",
+            callback=_device,
+            default=default,
+            show_default=True,
+            help=device,
+        ),
+        click.option(
+            "--threads",
+            type=click.IntRange(min=1),
+            help="Number of CPU threads; default: all cores.",
+        ),
+    )
 
 
 def _device(ctx: click.Context, param: click.Parameter, value: str) -> str:
@@ -201,86 +210,62 @@ class SceneOptions:
 
 def scene_options(data: str = f"{DATA_HELP} {TRAINED_ON}") -> Callable[[Function], Function]:
     """The options of ``SceneOptions``, which a command gets as ``scene``."""
+    names = ("data", "images", "resolution", "white_background")
 
-    def decorate(function: Function) -> Function:
-        @functools.wraps(function)
-        def with_scene(
-            *args: Any,
-            data: Path | None,
-            images: str,
-            resolution: int,
-            white_background: bool,
-            **kwargs: Any,
-        ) -> Any:
-            scene = SceneOptions(data, images, resolution, white_background, given())
-            return function(*args, scene=scene, **kwargs)
+    def gather(given: dict[str, Any]) -> dict[str, Any]:
+        source = click.get_current_context().get_parameter_source
+        chosen = frozenset(name for name in names if source(name) is not ParameterSource.DEFAULT)
+        data, images, resolution, white_background = map(given.pop, names)
+        return {"scene": SceneOptions(data, images, resolution, white_background, chosen)}
 
-        options = together(
-            click.option("--data", type=FILE, help=data),
-            click.option(
-                "--images",
-                metavar="NAME",
-                default="images",
-                show_default=True,
-                help="Folder of --data with the images, such as images_4. Without images/, the "
-                "largest of images_2, images_4 and images_8 serves.",
-            ),
-            click.option(
-                "--resolution",
-                type=click.IntRange(1, 16),
-                default=1,
-                show_default=True,
-                help="Divide the images' sides by this.",
-            ),
-            click.option(
-                "--white-background",
-                is_flag=True,
-                help="Composite transparent images over white, as the model was trained.",
-            ),
-        )
-        return options(with_scene)  # type: ignore[return-value]
-
-    return decorate
-
-
-def own_picture_options(function: Function) -> Function:
-    """``--self``, ``--cameras`` and ``--orbit``, for what is compared with a model's own pictures.
-
-    A command gets ``itself``, whether one of them was given, and ``cameras``, of a file or None.
-    ``CAMERAS_APART`` are its rules.
-    """
-
-    @functools.wraps(function)
-    def with_own_pictures(
-        *args: Any, itself: bool, cameras: Path | None, orbit: bool, **kwargs: Any
-    ) -> Any:
-        itself = itself or orbit or cameras is not None
-        return function(*args, itself=itself, cameras=cameras, **kwargs)
-
-    options = together(
+    return bundled(
+        gather,
+        click.option("--data", type=FILE, help=data),
         click.option(
-            "--self",
-            "itself",
+            "--images",
+            metavar="NAME",
+            default="images",
+            show_default=True,
+            help="Folder of --data with the images, such as images_4. Without images/, the "
+            "largest of images_2, images_4 and images_8 serves.",
+        ),
+        click.option(
+            "--resolution",
+            type=click.IntRange(1, 16),
+            default=1,
+            show_default=True,
+            help="Divide the images' sides by this.",
+        ),
+        click.option(
+            "--white-background",
             is_flag=True,
-            help="Measure against the model's own pictures instead of photographs, from the "
-            "cameras of --data, or as --orbit.",
+            help="Composite transparent images over white, as the model was trained.",
         ),
-        click.option(
-            "--cameras", type=FILE, help="Likewise, from a cameras.json or transforms*.json."
-        ),
-        click.option("--orbit", is_flag=True, help="Likewise, from cameras all around the model."),
     )
-    return options(with_own_pictures)  # type: ignore[return-value]
 
 
-def given() -> frozenset[str]:
-    """Names of the parameters of the running command that the user gave."""
-    context = click.get_current_context()
-    return frozenset(
-        name
-        for name in context.params
-        if context.get_parameter_source(name) is not ParameterSource.DEFAULT
-    )
+def _own_pictures(given: dict[str, Any]) -> dict[str, Any]:
+    itself, orbit, cameras = map(given.pop, ("itself", "orbit", "cameras"))
+    return {"itself": itself or orbit or cameras is not None, "cameras": cameras}
+
+
+own_picture_options = bundled(
+    _own_pictures,
+    click.option(
+        "--self",
+        "itself",
+        is_flag=True,
+        help="Measure against the model's own pictures instead of photographs, from the "
+        "cameras of --data, or as --orbit.",
+    ),
+    click.option("--cameras", type=FILE, help="Likewise, from a cameras.json or transforms*.json."),
+    click.option("--orbit", is_flag=True, help="Likewise, from cameras all around the model."),
+)
+"""For what is compared with a model's own pictures.
+
+A command gets ``itself``, whether one of them was given, and ``cameras``, of a file or None.
+``CAMERAS_APART`` are its rules.
+"""
 
 
 truncation_option = click.option(

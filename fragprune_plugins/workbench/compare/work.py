@@ -19,7 +19,7 @@ from fragprune_plugins.workbench.commands.opening import (
 )
 from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
-from fragprune_plugins.workbench.figures.panels import leave_panels
+from fragprune_plugins.workbench.figures.pictures import leave_panels
 from fragprune_plugins.workbench.figures.recorded import Recorded, recorded
 from fragprune_plugins.workbench.figures.wording import (
     describe,
@@ -27,8 +27,7 @@ from fragprune_plugins.workbench.figures.wording import (
     nothing_drawn,
     strangers,
 )
-from fragprune_plugins.workbench.models.model import load
-from fragprune_plugins.workbench.models.written import writable_folder
+from fragprune_plugins.workbench.models.model import load, writable_folder
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
 from fragprune_plugins.workbench.scenes.output import trained_on
 

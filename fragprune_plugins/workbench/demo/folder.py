@@ -10,7 +10,7 @@ from pathlib import Path
 from fragprune_plugins.errors import OutputError
 from fragprune_plugins.files.atomic import digest, replacing
 from fragprune_plugins.files.reading import MEBIBYTE, Door
-from fragprune_plugins.workbench.models.written import writable_folder
+from fragprune_plugins.workbench.models.model import writable_folder
 
 MARKER = ".fragprune-demo"
 """JSON with "files": SHA-256 of each file that the demo wrote, by path in the folder."""

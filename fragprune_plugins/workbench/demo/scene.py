@@ -8,7 +8,7 @@ from pathlib import Path
 from PIL import Image
 
 from fragprune_plugins.files.atomic import replacing
-from fragprune_plugins.workbench.models.written import writable_folder
+from fragprune_plugins.workbench.models.model import writable_folder
 
 ROOM = Path(__file__).with_name("room")
 """``images/`` and ``sparse/0/``. ``python -m lab.room`` in docs/experiments made them."""

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import platform
+import re
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
-from typing import Any
+from typing import Any, Final
 
 import torch
 
 from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.engines.cuda import driver, kernels, self_check
-from fragprune_plugins.engines.cuda.frame import MACROS
+from fragprune_plugins.engines.cuda.frame import MACROS, blend_macros, unblend_macros
 from fragprune_plugins.errors import EngineError, UsageError
 from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.workbench.commands.command import Report
-from fragprune_plugins.workbench.doctor.compiling import VARIANTS, resources
 
 _PACKAGES = ("fragprune-plugins", "torch", "numpy", "pluggy", "wrapt", "plyfile", "scikit-image")
 
@@ -157,3 +158,53 @@ def _cuda_engine() -> dict[str, Any]:
         "kept": str(kernels.cache_folder()),
         "reason": driver.missing(),
     }
+
+
+_TRAINED: Final = frozenset(("means", "hook", "opacities", "scales", "rotations", "sh"))
+
+VARIANTS: Final[tuple[tuple[str, dict[str, int]], ...]] = (
+    ("scene", {}),
+    ("blend", blend_macros()),
+    ("blend", blend_macros(counts=True)),
+    ("blend", blend_macros(stop=True)),
+    *(
+        ("unblend", unblend_macros(frozenset(wanted), sh_turns=True, invdepth=invdepth))
+        for wanted in (_TRAINED, _TRAINED | {"thresholds"}, {"opacities", "thresholds"})
+        for invdepth in (False, True)
+    ),
+)
+"""Sources with macros that training and fine-tuning usually ask for, to be built beforehand."""
+
+
+@dataclass(frozen=True)
+class Resources:
+    """The resources of a multiprocessor that a kernel needs.
+
+    Attributes:
+        registers: per thread.
+        stack: bytes of local memory per thread, for arrays that did not fit into registers.
+        spills: bytes stored to local memory and loaded again.
+        shared: bytes of shared memory per block.
+    """
+
+    registers: int
+    stack: int
+    spills: int
+    shared: int
+
+
+def resources(log: str) -> dict[str, Resources]:
+    """The resources of each kernel, from the report of ptxas -v."""
+    found = {}
+    for part in re.split(r"Compiling entry function '", log)[1:]:
+        name = part.split("'", 1)[0]
+        stack, stores, loads = re.findall(r"(\d+) bytes (?:stack|spill)", part)[:3]
+        registers = re.search(r"Used (\d+) registers", part)
+        shared = re.search(r"(\d+) bytes smem", part)
+        found[name] = Resources(
+            registers=int(registers.group(1)) if registers else 0,
+            stack=int(stack),
+            spills=int(stores) + int(loads),
+            shared=int(shared.group(1)) if shared else 0,
+        )
+    return found

@@ -13,14 +13,8 @@ from fragprune_plugins.files.ply import THRESHOLD_COLUMN
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.models import formats
-from fragprune_plugins.workbench.models.model import load, save
-from fragprune_plugins.workbench.models.written import (
-    describe_dropped,
-    describe_written,
-    dropping,
-    require_place,
-)
-from fragprune_plugins.workbench.pruning.visibility import visible
+from fragprune_plugins.workbench.models.model import describe_written, load, require_place, save
+from fragprune_plugins.workbench.pruning import visible
 
 
 def export(
@@ -46,8 +40,12 @@ def export(
     if keep == "visible":
         size, splat = out.stat().st_size, splat.keep(visible(splat))
         save(out, splat)
-        dropped = dropping(out, size, count, len(splat))
-        lines.append(describe_dropped(dropped, "too faint for any view"))
+        gone, left = count - len(splat), out.stat().st_size
+        dropped = {"gaussians": gone, "of": count, "bytes_before": size, "bytes_after": left}
+        lines.append(
+            f"Dropped {gone:,} of {count:,} Gaussians, too faint for any view: "
+            f"{size:,} -> {left:,} bytes."
+        )
     truncated = splat.falloff is not None
     column = THRESHOLD_COLUMN if form.paired and truncated else None
     held = "cutoffs" if truncated else "no cutoffs"

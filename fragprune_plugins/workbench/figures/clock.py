@@ -1,14 +1,20 @@
-"""Wall-clock time of a frame, including work that is still queued on a GPU."""
+"""Wall-clock times of frames, including work that is still queued on a GPU."""
 
 from __future__ import annotations
 
+import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import torch
 
 Made = TypeVar("Made")
+
+
+def standard_error(values: Sequence[float]) -> float:
+    """Of the mean of values; 0 for a single one."""
+    return statistics.stdev(values) / len(values) ** 0.5 if len(values) > 1 else 0.0
 
 
 def synchronize(device: torch.device) -> None:

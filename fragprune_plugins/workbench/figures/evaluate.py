@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.area import SQUARED_RADIUS
 from fragprune_plugins.plugins.hooks import engine_for, thresholds_for
 from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View, one_line
-from fragprune_plugins.workbench.figures.clock import Made, timed
+from fragprune_plugins.workbench.figures.clock import Made, standard_error, timed
 from fragprune_plugins.workbench.figures.extents import covered
 from fragprune_plugins.workbench.figures.metrics import lpips, psnr, ssim
 from fragprune_plugins.workbench.models import model as models
@@ -26,6 +27,8 @@ from fragprune_plugins.workbench.ranks import launched
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 
 REPEATS = 9
+
+_COUNTED = ("fragments_per_pixel", "evaluated_per_pixel", "entries_per_pixel")
 
 SILENT = 2.0
 """Seconds of measuring before a bar shows how far it is."""
@@ -53,15 +56,18 @@ class Candidate:
         """(N,) to draw a view with; None for no truncation."""
         return thresholds_for(inputs, self.model.thresholds if self.cut is None else self.cut)
 
-    def inputs(self, view: View, splats: Splats) -> RasterInputs:
-        """The inputs of one view with the activated model; only the image is asked for."""
-        return RasterInputs(view, splats, planes=(), **{**self.model.rules, **self.drawing})
+    @cached_property
+    def splats(self) -> Splats:
+        """The activated Gaussians."""
+        return self.model.splats()
 
-    def draw(
-        self, engine: Engine, view: View, splats: Splats, *, counts: bool = False
-    ) -> RasterOutputs:
-        """Draw one view of the activated model, optionally with counts of fragments."""
-        inputs = replace(self.inputs(view, splats), counts=counts)
+    def inputs(self, view: View) -> RasterInputs:
+        """The inputs of one view; only the image is asked for."""
+        return RasterInputs(view, self.splats, planes=(), **{**self.model.rules, **self.drawing})
+
+    def draw(self, engine: Engine, view: View, *, counts: bool = False) -> RasterOutputs:
+        """Draw one view, optionally with counts of fragments."""
+        inputs = replace(self.inputs(view), counts=counts)
         return engine.rasterize(inputs, self.thresholds(inputs))
 
 
@@ -123,48 +129,49 @@ def measure_all(
     if isinstance(engine, str):
         engine = engine_for(engine, device)
     shots = [shot.to(device) for shot in shots]
-    drawn = [candidate.model.splats() for candidate in candidates]
     reports: list[dict[str, Any]] = []
-    for candidate, splats in zip(candidates, drawn, strict=True):
-        rows, distances = [], []
+    for candidate in candidates:
+        rows: list[dict[str, float | None]] = []
         for shot in bar(shots, "measuring"):
-            outputs = candidate.draw(engine, shot.view, splats)
+            outputs, picture = candidate.draw(engine, shot.view), shot.image
             seen = shot.looked_at(outputs.image)
-            distances.append(lpips(seen, shot.image))
             rows.append(
-                (
-                    psnr(seen, shot.image),
-                    ssim(seen, shot.image),
-                    float(outputs.fragments_per_pixel),
-                    float(outputs.evaluated_per_pixel),
-                    float(outputs.entries_per_pixel),
-                    covered_per_pixel(engine, candidate.inputs(shot.view, splats)),
-                )
+                {
+                    "psnr": psnr(seen, picture),
+                    "ssim": ssim(seen, picture),
+                    "lpips": lpips(seen, picture),
+                    **{name: float(getattr(outputs, name)) for name in _COUNTED},
+                    "area_per_pixel": covered_per_pixel(engine, candidate.inputs(shot.view)),
+                }
             )
-        means = map(statistics.fmean, zip(*rows, strict=True))
-        quality, likeness, fragments, evaluated, entries, area = means
-        reports.append(
-            {
-                "target": shots[0].target,
-                "psnr": quality,
-                "ssim": likeness,
-                "lpips": _mean(distances),
-                "fragments_per_pixel": fragments,
-                "evaluated_per_pixel": evaluated,
-                "entries_per_pixel": entries,
-                "area_per_pixel": area,
-                "gaussians": candidate.gaussians or len(splats),
-            }
-        )
+        means = {name: _mean([row[name] for row in rows]) for name in rows[0]}
+        whole = candidate.gaussians or len(candidate.model)
+        reports.append({"target": shots[0].target, **means, "gaussians": whole})
 
-    views = [
-        replace(view, width=enlarge * view.width, height=enlarge * view.height)
-        for view in (shot.view for shot in shots)
-    ]
+    views = [enlarged(shot.view, enlarge) for shot in shots]
     frames = frame_times(candidates, views, engine, repeats=repeats)
     for report, frame in zip(reports, frames, strict=True):
         report |= frame | {"engine": engine.name, "device": str(device), "views": len(shots)}
     return reports
+
+
+def enlarged(view: View, times: int) -> View:
+    """The same view in a picture so many times as wide and high."""
+    return replace(view, width=times * view.width, height=times * view.height)
+
+
+@torch.no_grad()
+def psnrs(
+    candidate: Candidate, shots: Sequence[Shot], engine: Engine
+) -> tuple[list[float], list[float]]:
+    """PSNR of each view, dB, and the fragments per pixel of each."""
+    figures, fragments = [], []
+    for shot in shots:
+        shot = shot.to(candidate.model.device)
+        outputs = candidate.draw(engine, shot.view)
+        figures.append(psnr(shot.looked_at(outputs.image), shot.image))
+        fragments.append(float(outputs.fragments_per_pixel))
+    return figures, fragments
 
 
 def bar(items: Sequence[Made], what: str) -> Iterable[Made]:
@@ -206,27 +213,28 @@ def frame_times(
     Returns:
         One dict a candidate: frame_ms and frame_ms_se, as those of ``measure``.
     """
-    device = candidates[0].model.device
-    drawn = [candidate.model.splats() for candidate in candidates]
-    times: list[list[list[float]]] = [[] for _ in candidates]  # candidate, repeat, view
-    turns = list(zip(candidates, drawn, times, strict=True))
-    for _ in bar(range(repeats), "timing frames"):
-        for rounds in times:
-            rounds.append([])
-        for view in views:
-            turns.reverse()  # neither is always the one that finds a cold cache
-            for candidate, splats, rounds in turns:
-                inputs = candidate.inputs(view, splats)
+    turns = rounds(candidates, views, engine)
+    times = [next(turns) for _ in bar(range(repeats), "timing frames")]
+    return [
+        {
+            "frame_ms": statistics.median(ms for frames in repeated for ms in frames),
+            "frame_ms_se": standard_error([statistics.median(frames) for frames in repeated]),
+        }
+        for repeated in zip(*times, strict=True)
+    ]
+
+
+def rounds(
+    candidates: Sequence[Candidate], views: Sequence[View], engine: Engine
+) -> Iterator[list[list[float]]]:
+    """Frames of candidates in turns, without end: for each of them the milliseconds by view."""
+    order = list(enumerate(candidates))
+    for turn in count():
+        spent: list[list[float]] = [[] for _ in candidates]
+        for number, view in enumerate(views):
+            # Of two neither is always the one that finds a cold cache.
+            for index, candidate in order[:: 1 if (turn + number) % 2 else -1]:
+                inputs = candidate.inputs(view)
                 frame = partial(engine.rasterize, inputs, candidate.thresholds(inputs))
-                rounds[-1].append(timed(frame, device)[1])
-    reports = []
-    for rounds in times:
-        medians = [statistics.median(frames) for frames in rounds]
-        spread = statistics.stdev(medians) if len(medians) > 1 else 0.0
-        reports.append(
-            {
-                "frame_ms": statistics.median(ms for frames in rounds for ms in frames),
-                "frame_ms_se": spread / len(medians) ** 0.5,
-            }
-        )
-    return reports
+                spent[index].append(timed(frame, candidate.model.device)[1])
+        yield spent

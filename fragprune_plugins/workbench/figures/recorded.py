@@ -1,9 +1,9 @@
-"""Takes out of a record how its models are drawn, and what they were measured against."""
+"""How a record says how its models are drawn, and what they were measured against."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +26,16 @@ class Recorded:
 
     photographs: Photographs
     models: tuple[Path, ...]
-    filtered: bool
-    drawing: Mapping[str, Any]
+    filtered: bool = False
+    drawing: Mapping[str, Any] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, for ``recorded``."""
+        return self.photographs.as_dict() | {
+            "models": [str(model.resolve()) for model in self.models],
+            "filtered": self.filtered,
+            "drawing": dict(self.drawing),
+        }
 
 
 def recorded(record: Record) -> Recorded | None:

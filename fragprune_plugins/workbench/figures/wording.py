@@ -87,7 +87,7 @@ def tabulate(columns: Mapping[str, dict[str, Any]]) -> list[list[str]]:
     rows = [["", *columns, *change]]
     itself = reports[-1].get("target") == ITSELF
     for label, key, digits in _ROWS:
-        if key == "lpips" and not all(_known(each.get(key)) for each in reports):
+        if key == "lpips" and any(each.get(key) is None for each in reports):
             continue  # an installation may lack it
         if key == "psnr" and itself:  # before, it is infinite: null in a record
             equal = ["equal" if each is reports[0] else f"{each[key]:.2f}" for each in reports]
@@ -120,10 +120,6 @@ def nothing_drawn(fragments: Sequence[float]) -> list[str]:
         f"{empty} of {len(fragments)} show no Gaussian (0.0 fragments per pixel). Are these the "
         "cameras of this model?"
     ]
-
-
-def _known(figure: float | None) -> bool:
-    return figure is not None and not math.isnan(figure)
 
 
 def gain(before: dict[str, Any], after: dict[str, Any]) -> str:

@@ -12,10 +12,9 @@ from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.interruption import Terminate
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.plugins.hooks import engine_for, schedule_for
-from fragprune_plugins.workbench.distributed.processes import processes_of
+from fragprune_plugins.workbench.distributed import processes_of
 from fragprune_plugins.workbench.finetune.faster import FrameTarget
-from fragprune_plugins.workbench.finetune.loop import Training
-from fragprune_plugins.workbench.finetune.result import FinetuneResult
+from fragprune_plugins.workbench.finetune.loop import FinetuneResult, Training
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints, Keeper
 from fragprune_plugins.workbench.finetune.searching import strongest
 from fragprune_plugins.workbench.goals import AtMost, Faster

@@ -6,7 +6,7 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import torch
@@ -18,8 +18,7 @@ from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.stage2 import evenly
 from fragprune_plugins.learning.targets import FEWEST, Target, calibrate
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.types import RasterInputs
-from fragprune_plugins.workbench.figures.clock import timed
+from fragprune_plugins.workbench.figures.evaluate import Candidate, rounds
 from fragprune_plugins.workbench.goals import TIME_FOLLOWS
 from fragprune_plugins.workbench.scenes.dataset import Shot
 
@@ -56,14 +55,8 @@ class FrameTarget(Target):
 
     def measure(self, views: Sequence[Any]) -> float:
         """How many times as fast frames of these views are now."""
-        training = self.training
-        return times_faster(
-            training.start,
-            training.result_model(),
-            training.stage.thresholds,
-            views,
-            training.engine,
-        )
+        start, now = self.training.start.untruncated(), self.training.result_model()
+        return times_faster(Candidate(start), Candidate(now), views, self.training.engine)
 
     def followed(self, fragments: float) -> float:
         """The ratio of frame times that a ratio of fragments brings, by what was timed so far."""
@@ -164,16 +157,16 @@ def require_reach(target: float, model: Model, shots: Sequence[Shot], engine: En
     Raises:
         UsageError: frames with so few fragments as no target leaves take longer.
     """
-    some, splats = evenly(shots, LIMIT_VIEWS), model.splats()
-    store = ThresholdStore.from_falloff(torch.full_like(splats.opacities, 0.05))
-    inputs = [RasterInputs(shot.view, splats, planes=()) for shot in some]
+    some, plain = evenly(shots, LIMIT_VIEWS), Candidate(model.untruncated())
+    store = ThresholdStore.from_falloff(torch.full_like(plain.splats.opacities, 0.05))
+    inputs = [plain.inputs(shot.view) for shot in some]
 
     def drawn(cut: Tensor | None) -> float:
         return sum(float(engine.rasterize(each, cut).fragments_per_pixel) for each in inputs)
 
     before = drawn(None)
     calibrate(store, lambda: before / max(drawn(store.values), 1e-9), FEWEST, tolerance=0.1)
-    limit = times_faster(model, model.untruncated(), lambda _: store.values, some, engine)
+    limit = times_faster(plain, replace(plain, cut=store.values), some, engine)
     if target >= limit:
         size = f"{shots[0].view.width}x{shots[0].view.height}"
         raise UsageError(
@@ -185,32 +178,15 @@ def require_reach(target: float, model: Model, shots: Sequence[Shot], engine: En
 
 
 @torch.no_grad()
-def times_faster(
-    before: Model,
-    now: Model,
-    thresholds: Callable[[RasterInputs], Tensor | None],
-    shots: Sequence[Shot],
-    engine: Engine,
-) -> float:
-    """Frame time of a model without thresholds, over that of another with them.
+def times_faster(before: Candidate, now: Candidate, shots: Sequence[Shot], engine: Engine) -> float:
+    """Frame time of a model over that of another.
 
     The median over views of the ratio of their least times: a view that another program disturbed
     in all rounds moves it little.
-
-    Args:
-        before: drawn without thresholds and stop.
-        now: drawn with them; free of gradients, for which an engine would keep states.
     """
-    old, new = before.splats(), now.splats()
-    least = {True: [math.inf] * len(shots), False: [math.inf] * len(shots)}
-    started, turn = time.perf_counter(), 0
-    while turn < _ROUNDS or time.perf_counter() - started < _SECONDS:
-        turn += 1
-        for index, shot in enumerate(shots):
-            for first in (True, False) if turn % 2 else (False, True):
-                splats, rules = (old, {}) if first else (new, now.rules)
-                inputs = RasterInputs(shot.view, splats, planes=(), **rules)
-                cut = None if first else thresholds(inputs)
-                spent = timed(partial(engine.rasterize, inputs, cut), before.xyz.device)[1]
-                least[first][index] = min(least[first][index], spent)
-    return statistics.median(was / is_ for was, is_ in zip(least[True], least[False], strict=True))
+    started, least = time.perf_counter(), torch.full((2, len(shots)), math.inf).double()
+    for turn, found in enumerate(rounds([before, now], [shot.view for shot in shots], engine), 1):
+        least = least.minimum(torch.tensor(found).to(least))
+        if turn >= _ROUNDS and time.perf_counter() - started >= _SECONDS:
+            break
+    return float(statistics.median((least[0] / least[1]).tolist()))

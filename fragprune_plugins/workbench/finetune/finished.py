@@ -5,16 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import RecordError
 from fragprune_plugins.files import records
-from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.learning.interruption import EXIT_CODE
+from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.workbench.commands.command import Report
+from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
+from fragprune_plugins.workbench.figures.recorded import Recorded
 from fragprune_plugins.workbench.figures.wording import (
     FELL,
     ITSELF,
@@ -24,11 +26,11 @@ from fragprune_plugins.workbench.figures.wording import (
     next_steps,
     outcome,
 )
-from fragprune_plugins.workbench.finetune.result import FinetuneResult
+from fragprune_plugins.workbench.finetune.loop import FinetuneResult
 from fragprune_plugins.workbench.finetune.searching import Bounded
-from fragprune_plugins.workbench.finetune.trial import DROPOUT, KEEP
+from fragprune_plugins.workbench.finetune.trial import DROPOUT, KEEP, Keep
 from fragprune_plugins.workbench.models import formats
-from fragprune_plugins.workbench.models.written import describe_written
+from fragprune_plugins.workbench.models.model import describe_written
 from fragprune_plugins.workbench.scenes.dataset import Dataset
 
 LOST = 0.05
@@ -37,15 +39,31 @@ LOST = 0.05
 _OF_RECORDS = {"cameras", "curves", "photographs", "configuration", "text"}
 
 
+@dataclass(frozen=True)
+class Asked:
+    """The options of the command, by their names there."""
+
+    model: Path
+    out: Path
+    itself: bool
+    cameras: Path | None
+    scene: SceneOptions
+    settings: Settings
+    keep: Keep
+    seed: int
+    shard: bool
+    no_truncation: bool
+    again: bool
+    engine: EngineOptions
+
+
 @dataclass(frozen=True, eq=False)
 class Finetuned:
     """A fine-tuning that is over.
 
     Attributes:
+        asked: the command's options, with what a trial chose.
         start: the model as it came in.
-        saved: the model in ``out``: of all processes, where they divided it.
-        itself: the model's own pictures were the training views.
-        keep: the share of Gaussians to learn with, or how to choose it; None for all.
         forgotten: dB that a trial made other photographs worse; None without a trial.
         removed: Gaussians that went before learning.
         found: what a search for the strongest truncation found; None without one.
@@ -53,17 +71,12 @@ class Finetuned:
         shards: processes that hold a part of the Gaussians each; 1 where each holds them all.
     """
 
-    model: Path
-    out: Path
+    asked: Asked
     start: Candidate
     result: FinetuneResult
-    saved: Model
-    itself: bool
-    keep: float | Literal["auto", "visible"] | None
     forgotten: float | None
     removed: int
     found: Bounded | None
-    seed: int
     truncated: bool
     shards: int = 1
 
@@ -86,51 +99,45 @@ class Finetuned:
         figures: Sequence[dict[str, Any]],
         dataset: Dataset,
         photographs: Photographs | None,
-        asked: dict[str, Any],
-        pictures: dict[str, Any] | None = None,
+        configuration: dict[str, Any],
     ) -> Report:
         """Leave a record, and say what came of it.
 
         Args:
             dataset: whose held-out views it was measured on.
             photographs: where they lie, for the record; None where there are none.
-            asked: the configuration, by which the same command is known again.
-            pictures: the cameras of the model's own pictures, for the record.
+            configuration: by which the same command is known again.
         """
-        data = self._data(figures)
-        result = self.result
+        data, asked, result = self._data(figures), self.asked, self.result
         text = self._text(data, len(dataset.test), len(dataset.train) + len(dataset.test))
         more: dict[str, Any] = {"curves": [asdict(point) for point in result.curves]}
-        more |= {"cameras": pictures} if pictures else {}
+        if asked.itself:
+            more["cameras"] = asked.scene.as_record(asked.cameras)
         if not result.interrupted:
-            more |= {"configuration": asked, "text": text}
+            more |= {"configuration": configuration, "text": text}
         scene = None
         if photographs is not None:
             scene = photographs.folder
-            more["photographs"] = photographs.as_dict() | {
-                "models": [str(self.model.resolve()), str(self.out.resolve())],
-                "filtered": False,
-                "drawing": {},
-            }
-        records.leave(self.out, "finetune", data | more)
-        text += f"\n{next_steps(self.out, self.out.parent, scene)}"  # records name no folders
+            more["photographs"] = Recorded(photographs, (asked.model, asked.out)).as_dict()
+        records.leave(asked.out, "finetune", data | more)
+        text += f"\n{next_steps(asked.out, asked.out.parent, scene)}"  # records name no folders
         return Report(data, text, exit_code=130 if result.interrupted else 0)
 
     def _data(self, figures: Sequence[dict[str, Any]]) -> dict[str, Any]:
         """What the record and ``--json`` say, from figures as ``measured``."""
-        result, settings = self.result, self.result.settings
+        asked, result, settings = self.asked, self.result, self.result.settings
         before, after, *without = figures
         control = without.pop() if self.found is not None else None
         done = result.progress
         data: dict[str, Any] = {
-            "model": str(self.model),
-            "out": str(self.out),
+            "model": str(asked.model),
+            "out": str(asked.out),
             "target": after["target"],
             "before": before,
             "after": after,
             "untruncated": without[0] if without else None,
-            "self": self.itself,
-            "keep": self.keep,
+            "self": asked.itself,
+            "keep": asked.keep,
             "forgotten": self.forgotten,
             "speedup": done.speedup,
             "faster": done.faster,
@@ -144,12 +151,12 @@ class Finetuned:
             "engine": result.engine,
             "device": after["device"],
             "adapter": None,
-            "seed": self.seed,
+            "seed": asked.seed,
             "shards": self.shards,
             "settings": settings.as_dict(),
             "max_drop": None if self.found is None else self.found.as_dict(),
         }
-        data["control"] = control or records.control_of(data, records.files(self.out.parent))
+        data["control"] = control or records.control_of(data, records.files(asked.out.parent))
         return data
 
     def _text(self, data: dict[str, Any], held_out: int, views: int) -> str:
@@ -179,11 +186,11 @@ class Finetuned:
         plain = data["untruncated"]
         if plain is not None:
             lines.append(describe_untruncated(before, plain))
-        form = formats.named(self.out)
+        form = formats.named(self.asked.out)
         held = ", which holds the cutoffs" if plain else ""
         if settings.goal.on_area:
             held = ", which every viewer draws as it is"
-        lines.append(describe_written(self.out, held))
+        lines.append(describe_written(self.asked.out, held))
         if form.keeps:
             lines.append("The figures above are of the model as it was learned, before rounding.")
         return "\n".join(lines)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import random
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -18,18 +18,21 @@ from fragprune_plugins.engines import Engine
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.adam import make_adam
 from fragprune_plugins.learning.area import area_per_pixel
-from fragprune_plugins.learning.events import StepStats
+from fragprune_plugins.learning.events import Progress, StepStats
 from fragprune_plugins.learning.schedule import Schedule, Settings
-from fragprune_plugins.learning.stage2 import Stage2
 from fragprune_plugins.learning.targets import Target
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.learning.waiting import Waiting, between_steps
 from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.hooks import thresholds_for
 from fragprune_plugins.plugins.loading import installed
-from fragprune_plugins.types import RasterInputs, RasterOutputs
+from fragprune_plugins.types import RasterInputs, RasterOutputs, one_line
 from fragprune_plugins.workbench.finetune.losses import photometric_loss
+from fragprune_plugins.workbench.finetune.processes import Processes, SharedStage
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
+
+if TYPE_CHECKING:
+    from fragprune_plugins.workbench.finetune.resuming import Keeper
 
 # Learning rates at the start of stage 2, the hosts' own; all decay with the opacity's. Positions
 # (times the scene's extent) take a tenth of the hosts' first: a tenth of that held out less, and a
@@ -39,78 +42,34 @@ _GEOMETRY = {"xyz": 1.6e-5, "scaling": 0.005, "rotation": 0.001}
 _POSTFIXES = 100  # times in a run that the bar says how it goes
 
 
-class Keeper(Protocol):
-    """Writes the checkpoints of a training."""
-
-    def due(self, step: int) -> bool:
-        """Whether it is time for one after a step."""
-
-    def keep(self, training: Training) -> None:
-        """Write one."""
-
-
-class Alone:
-    """One process, which holds the whole model.
-
-    A training asks it in every step. Several processes (``workbench.distributed``) override what
-    they do otherwise.
+@dataclass(frozen=True, eq=False)
+class FinetuneResult:
+    """Result of a fine-tuning.
 
     Attributes:
-        first: this process writes files and speaks.
-        several: there are others.
-        divided: other processes hold other Gaussians of the model.
-        may_end: a signal may end the training after this step.
-        stage: how thresholds learn.
+        model: the Gaussians with what they learned; what ``train`` did not name is the very tensor
+            that came in. A control and a portable model have no thresholds.
+        settings: of the fine-tuning.
+        curves: one point per step.
+        progress: steps done, fragments before and after on the training views, the target.
+        train_seconds: wall-clock seconds of the loop.
+        engine: the engine's name.
+        interrupted: Ctrl-C or SIGTERM ended it early; the result is what was learned until then.
+        terminated: SIGTERM ended it.
+        resumed_at: steps that came out of a checkpoint; 0 without one.
     """
 
-    stage: type[Stage2] = Stage2
-    first = True
-    several = False
-    divided = False
-    may_end = True
+    model: Model
+    settings: Settings
+    curves: Sequence[StepStats]
+    progress: Progress
+    train_seconds: float
+    engine: str
+    interrupted: bool
+    terminated: bool
+    resumed_at: int = 0
 
-    def expect_able(self, settings: Settings) -> None:
-        """Raise UsageError if these processes cannot share the work of settings."""
-
-    def agree(self, known: dict[str, Any]) -> None:
-        """Raise RanksError if another process is about to learn something else."""
-
-    def share(self, shots: Sequence[Shot]) -> Sequence[Shot]:
-        """The views of a step that this process draws."""
-        return shots
-
-    def went_backward(self, training: Training, shots: Sequence[Shot], waiting: Waiting) -> None:
-        """The gradients of a step are there; raises RanksError if another process is gone."""
-
-    def stepped(self, training: Training) -> None:
-        """A step is over; raises RanksError if processes have parted."""
-
-    def finished(self, training: Training) -> None:
-        """The last step is over; raises RanksError if processes have parted."""
-
-    def keeps(self, training: Training) -> bool:
-        """Whether it is time for a checkpoint after this step."""
-        return training.keeper is not None and training.keeper.due(training.done)
-
-    def described(self, configuration: dict[str, Any]) -> dict[str, Any]:
-        """What decides the result, in the words of all processes together."""
-        return configuration
-
-    def total(self, count: int) -> int:
-        """Gaussians of the whole model, from those that this process holds."""
-        return count
-
-    def everywhere(self, rows: Tensor) -> Tensor:
-        """The rows of all Gaussians, in each process."""
-        return rows
-
-    def whole(self, rows: Tensor) -> Tensor:
-        """The rows of all Gaussians, in the first process; there may be none in others."""
-        return rows
-
-    def own(self, rows: Tensor) -> Tensor:
-        """This process' rows, of those of all Gaussians."""
-        return rows
+    __repr__ = one_line
 
 
 class Training:
@@ -138,7 +97,7 @@ class Training:
         settings: Settings,
         schedule: Schedule,
         engine: Engine,
-        processes: Alone,
+        processes: Processes,
         target: Target | None = None,
     ) -> None:
         self.start, self.dataset, self.settings = start, dataset, settings
@@ -148,7 +107,7 @@ class Training:
         self.keeper: Keeper | None = None
         self.started = time.perf_counter()
         known = start.thresholds if settings.goal.presses else None
-        self.stage = processes.stage(
+        self.stage = SharedStage(
             ThresholdStore(len(start), start.device) if known is None else known.clone(),
             settings,
             schedule,

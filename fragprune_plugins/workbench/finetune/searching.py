@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
-
-import torch
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import UsageError
@@ -20,9 +18,9 @@ from fragprune_plugins.learning.goals import Control, Pressure
 from fragprune_plugins.learning.interruption import Terminate
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.targets import FEWEST
-from fragprune_plugins.workbench.figures.evaluate import Candidate
-from fragprune_plugins.workbench.figures.metrics import psnr
-from fragprune_plugins.workbench.finetune.result import FinetuneResult
+from fragprune_plugins.workbench.figures.clock import standard_error
+from fragprune_plugins.workbench.figures.evaluate import Candidate, psnrs
+from fragprune_plugins.workbench.finetune.loop import FinetuneResult
 from fragprune_plugins.workbench.goals import AtMost
 from fragprune_plugins.workbench.scenes.dataset import Shot
 
@@ -53,22 +51,35 @@ class Trial:
     fragments_per_pixel: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Bounded:
-    """What the search found.
+    """What the search found so far.
 
     Attributes:
         bound: on the loss, dB.
-        result: the strongest truncation within the bound; the one that loses least where none is.
+        result: the strongest truncation within the bound; the one that loses least where none is;
+            the last training before any was measured.
         trial: its figures; None if the search was interrupted before they were taken.
         trials: all of them, in order.
     """
 
     bound: float
-    result: FinetuneResult
-    trial: Trial | None
     control: FinetuneResult
-    trials: Sequence[Trial]
+    result: FinetuneResult
+    trial: Trial | None = None
+    trials: list[Trial] = field(default_factory=list)
+
+    def take(self, result: FinetuneResult, trial: Trial) -> None:
+        """Take a training into account."""
+        self.trials.append(trial)
+        if self.trial is None or _better(trial, self.trial, self.bound):
+            self.result, self.trial = result, trial
+
+    def ended(self, last: FinetuneResult, terminated: bool) -> Bounded:
+        """The same after a signal, which came in or after the last training."""
+        best = last if self.trial is None else self.result
+        self.result = replace(best, interrupted=True, terminated=terminated)
+        return self
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for ``--json``: bound, met, the chosen trial's figures, all trials."""
@@ -104,88 +115,34 @@ def strongest(
     """
     if not isinstance(settings.goal, AtMost):
         raise UsageError("goal", str(settings.goal), "AtMost(decibels)", "Pass such a goal.")
-    search = _Search(settings.goal.decibels, say)
     say("Training the control, without pruning.")
-    search.last = search.control = control = train(replace(settings, goal=Control()))
-    if control.interrupted:
-        return search.ended(control.terminated)
+    last = control = train(replace(settings, goal=Control()))
+    found = Bounded(settings.goal.decibels, control, control)
+    pressure: float | None = None
     try:
-        reference, _ = _held_out(control, held_out, engine)
-        while not search.over():
-            search.announce()
-            search.last = result = train(replace(settings, goal=Pressure(search.pressure)))
-            if result.interrupted:
-                return search.ended(result.terminated)
-            figures, fragments = _held_out(result, held_out, engine)
+        reference = [] if control.interrupted else _held_out(control, held_out, engine)[0]
+        while not last.interrupted and len(found.trials) < TRAININGS:
+            at = "the default pressure" if pressure is None else f"pressure {pressure:.2g}"
+            say(f"Training {len(found.trials) + 1} of at most {TRAININGS}, at {at}.")
+            last = train(replace(settings, goal=Pressure(pressure)))
+            if last.interrupted:
+                break
+            figures, fragments = _held_out(last, held_out, engine)
             losses = [was - now for was, now in zip(reference, figures, strict=True)]
-            search.tried(result, losses, fragments)
+            loss, error = statistics.fmean(losses), standard_error(losses)
+            trial = Trial(last.progress.pressure, loss, error, fragments)
+            say(
+                f"Loss against the control: {trial.loss:.3f} dB at {fragments:.1f} fragments/pixel."
+            )
+            found.take(last, trial)
+            few = fragments * FEWEST < (last.progress.fragments_before or 0.0)
+            near = trial.loss >= found.bound - TOLERANCE
+            if (trial.loss <= found.bound and (few or near)) or pressure == _STRONGEST:
+                break
+            pressure = min(next_pressure(found.trials, found.bound), _STRONGEST)
     except KeyboardInterrupt as error:  # not in a training, which ends by itself
-        return search.ended(isinstance(error, Terminate))
-    return search.found()
-
-
-class _Search:
-    """A search under way.
-
-    Attributes:
-        bound: dB.
-        last: the training that ended last.
-        pressure: of the next training; None for the default one.
-        trials: all that were measured.
-        best: of them, with its result.
-    """
-
-    control: FinetuneResult
-    last: FinetuneResult
-
-    def __init__(self, bound: float, say: Callable[[str], None]) -> None:
-        self.bound, self.say = bound, say
-        self.pressure: float | None = None
-        self.trials: list[Trial] = []
-        self.best: tuple[FinetuneResult, Trial] | None = None
-        self._enough = False
-
-    def over(self) -> bool:
-        """Whether another training is not worth its time."""
-        return self._enough or len(self.trials) == TRAININGS
-
-    def announce(self) -> None:
-        """Say which training comes."""
-        pressure = self.pressure
-        at = "the default pressure" if pressure is None else f"pressure {pressure:.2g}"
-        self.say(f"Training {len(self.trials) + 1} of at most {TRAININGS}, at {at}.")
-
-    def tried(self, result: FinetuneResult, losses: Sequence[float], fragments: float) -> None:
-        """Take a training into account, and choose the next pressure.
-
-        Args:
-            losses: of each held-out view against the control, dB.
-            fragments: per pixel, mean over held-out views.
-        """
-        spread = statistics.stdev(losses) / len(losses) ** 0.5 if len(losses) > 1 else 0.0
-        trial = Trial(result.progress.pressure, statistics.fmean(losses), spread, fragments)
-        self.trials.append(trial)
-        self.say(
-            f"Loss against the control: {trial.loss:.3f} dB at {fragments:.1f} fragments/pixel."
-        )
-        if self.best is None or _better(trial, self.best[1], self.bound):
-            self.best = result, trial
-        before, kept = result.progress.fragments_before or 0.0, trial.loss <= self.bound
-        few, near = fragments * FEWEST < before, trial.loss >= self.bound - TOLERANCE
-        self._enough = (kept and (few or near)) or self.pressure == _STRONGEST
-        if not self.over():
-            self.pressure = min(next_pressure(self.trials, self.bound), _STRONGEST)
-
-    def found(self) -> Bounded:
-        """The best of all."""
-        assert self.best is not None
-        return Bounded(self.bound, *self.best, self.control, self.trials)
-
-    def ended(self, terminated: bool) -> Bounded:
-        """The best so far, after a signal; without a measured one the last."""
-        kept, trial = self.best or (self.last, None)
-        kept = replace(kept, interrupted=True, terminated=terminated)
-        return Bounded(self.bound, kept, trial, self.control, self.trials)
+        return found.ended(last, isinstance(error, Terminate))
+    return found.ended(last, last.terminated) if last.interrupted else found
 
 
 def next_pressure(trials: Sequence[Trial], bound: float) -> float:
@@ -218,16 +175,9 @@ def _better(trial: Trial, than: Trial, bound: float) -> bool:
     return trial.loss < than.loss
 
 
-@torch.no_grad()
 def _held_out(
     result: FinetuneResult, shots: Sequence[Shot], engine: Engine
 ) -> tuple[list[float], float]:
     """PSNR of each view, dB, and fragments per pixel, mean over views."""
-    candidate, splats = Candidate(result.model), result.model.splats()
-    figures, fragments = [], []
-    for shot in shots:
-        shot = shot.to(splats.device)
-        outputs = candidate.draw(engine, shot.view, splats)
-        figures.append(psnr(shot.looked_at(outputs.image), shot.image))
-        fragments.append(float(outputs.fragments_per_pixel))
+    figures, fragments = psnrs(Candidate(result.model), shots, engine)
     return figures, statistics.fmean(fragments)

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
-
-import torch
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.goals import Control, Fewer, Pressure
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.stage2 import evenly
-from fragprune_plugins.types import RasterInputs
-from fragprune_plugins.workbench.figures.metrics import psnr
-from fragprune_plugins.workbench.finetune.loop import Alone, Training
+from fragprune_plugins.workbench.figures.evaluate import Candidate, psnrs
+from fragprune_plugins.workbench.finetune.loop import Training
+from fragprune_plugins.workbench.finetune.processes import Processes
 from fragprune_plugins.workbench.finetune.resuming import Keeper
 from fragprune_plugins.workbench.goals import AtMost, Faster
-from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
+from fragprune_plugins.workbench.ranks import Ranks
+from fragprune_plugins.workbench.scenes.dataset import Dataset
 
 DROPOUT, KEEP = 0.2, 0.6
 """What suits a model that knows its photographs by heart; docs/results.md has the runs."""
@@ -121,24 +120,12 @@ def forgotten(
     learned, others = dataset.train[::2], evenly(dataset.train[1::2], _VIEWS)
     goal = Pressure(0.0) if model.falloff is not None else Control()
     settings = Settings(iterations=STEPS, goal=goal, threshold_lr=0.0, stop=None, seed=seed)
-    half = replace(dataset, train=learned)
-    training = Training(model, half, settings, Schedule(settings), engine, _Unheard())
+    half, alone = replace(dataset, train=learned), Processes(Ranks())
+    alone.first = False  # no observer is told of its steps
+    training = Training(model, half, settings, Schedule(settings), engine, alone)
     training.learn(Keeper(None, training), progress=False)
-    return _psnr(model, others, engine) - _psnr(training.result_model(), others, engine)
-
-
-class _Unheard(Alone):
-    """A process that tells no observer of its steps."""
-
-    first = False
-
-
-@torch.no_grad()
-def _psnr(model: Model, shots: Sequence[Shot], engine: Engine) -> float:
-    """Mean over photographs, in dB."""
-    splats, found = model.splats(), []
-    for shot in shots:
-        inputs = RasterInputs(shot.view, splats, planes=(), **model.rules)
-        image = shot.looked_at(engine.rasterize(inputs, model.falloff).image).clamp(0, 1)
-        found.append(psnr(image, shot.image))
-    return statistics.fmean(found)
+    before, after = (
+        statistics.fmean(psnrs(Candidate(each), others, engine)[0])
+        for each in (model, training.result_model())
+    )
+    return before - after

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import click
@@ -15,50 +14,27 @@ from fragprune_plugins.files.atomic import locked
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.learning.interruption import sigterm_interrupts
-from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.workbench.commands.command import Report
-from fragprune_plugins.workbench.commands.opening import open_engine, photographs_for, pictures_of
-from fragprune_plugins.workbench.commands.options import (
-    EngineOptions,
-    SceneOptions,
-    require_several,
-)
-from fragprune_plugins.workbench.distributed.processes import part_of, whole_of
-from fragprune_plugins.workbench.distributed.sharded import ShardedEngine
+from fragprune_plugins.workbench.commands.opening import OwnCameras, open_engine, photographs_for
+from fragprune_plugins.workbench.commands.options import require_several
+from fragprune_plugins.workbench.distributed import ShardedEngine, part_of, whole_of
 from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.finetune import api, resuming
 from fragprune_plugins.workbench.finetune import finished as finetuned
-from fragprune_plugins.workbench.finetune.finished import Finetuned
-from fragprune_plugins.workbench.finetune.result import FinetuneResult
+from fragprune_plugins.workbench.finetune.finished import Asked, Finetuned
+from fragprune_plugins.workbench.finetune.loop import FinetuneResult
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
 from fragprune_plugins.workbench.finetune.searching import Bounded, strongest
-from fragprune_plugins.workbench.finetune.trial import Keep, tried
+from fragprune_plugins.workbench.finetune.trial import tried
 from fragprune_plugins.workbench.goals import AtMost
 from fragprune_plugins.workbench.models import model as models
-from fragprune_plugins.workbench.models.written import require_place
-from fragprune_plugins.workbench.pruning.scores import keep_best, keep_needed
-from fragprune_plugins.workbench.pruning.visibility import visible
+from fragprune_plugins.workbench.models.model import require_place
+from fragprune_plugins.workbench.pruning import keep_best, keep_needed, visible
 from fragprune_plugins.workbench.ranks import Ranks, joined, launched
 from fragprune_plugins.workbench.scenes.dataset import Dataset, load_photographs
 from fragprune_plugins.workbench.scenes.generated import views_near
 
-
-@dataclass(frozen=True)
-class Asked:
-    """The options of the command, by their names there."""
-
-    model: Path
-    out: Path
-    itself: bool
-    cameras: Path | None
-    scene: SceneOptions
-    settings: Settings
-    keep: Keep
-    seed: int
-    shard: bool
-    no_truncation: bool
-    again: bool
-    engine: EngineOptions
+_say = partial(click.echo, err=True)
 
 
 @dataclass(frozen=True)
@@ -124,7 +100,7 @@ def _open(asked: Asked) -> _Opened:
     where = "cpu" if asked.shard else device
     whole = models.load(asked.model, truncation=truncation, device=where)
     if asked.itself:
-        dataset = pictures_of(whole, scene, asked.cameras, engine, seed=asked.seed)
+        dataset = OwnCameras(scene, asked.cameras, asked.seed).pictures(whole, engine)
     else:
         assert photographs is not None
         dataset = load_photographs(photographs)
@@ -166,26 +142,17 @@ def _learned(opened: _Opened, ranks: Ranks, lost: float | None) -> tuple[Finetun
     start = Candidate(whole, gaussians=count)
     kept = _keep(whole, asked, opened.dataset.to(opened.device), engine)
     result, found = _learn(kept, opened, engine, ranks)
-    saved = result
-    if asked.shard:
-        everything = whole_of(result.model, ranks)
-        saved = replace(result, model=everything) if ranks.first else result
+    saved = whole_of(result.model, ranks) if asked.shard else result.model
     if ranks.first:
         models.save(asked.out, saved)
-    truncated = saved.model.falloff is not None
     over = Finetuned(
-        model=asked.model,
-        out=asked.out,
-        start=start,
-        result=result,
-        saved=saved.model,
-        itself=asked.itself,
-        keep=asked.keep,
+        asked,
+        start,
+        result,
         forgotten=lost,
         removed=len(whole) - len(kept),
         found=found,
-        seed=asked.seed,
-        truncated=ranks.gather(truncated)[0] if asked.shard else truncated,
+        truncated=ranks.gather(saved.falloff is not None)[0],
         shards=ranks.size if asked.shard else 1,
     )
     return over, engine
@@ -197,17 +164,10 @@ def _report(opened: _Opened, over: Finetuned, measured: list[dict[str, Any]] | N
     if result.terminated:  # after SIGTERM there is no time for measurements
         return finetuned.terminated(asked.model, asked.out, result, over.found)
     figures = measured or over.measured(opened.dataset, opened.engine)
-    pictures = asked.scene.as_record(asked.cameras) if asked.itself else None
-    report = over.report(
-        figures, opened.dataset, opened.photographs, opened.configuration, pictures
-    )
+    report = over.report(figures, opened.dataset, opened.photographs, opened.configuration)
     if not result.interrupted:
         opened.checkpoints.clear()  # not before: a kill while measuring goes on from it too
     return report
-
-
-def _say(text: str) -> None:
-    click.echo(text, err=True)
 
 
 def _keep(whole: Model, asked: Asked, dataset: Dataset, engine: Engine) -> Model:

@@ -9,17 +9,16 @@ import torch
 
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import (
+    OwnCameras,
     chosen,
     open_engine,
     photographs_for,
-    pictures_of,
 )
 from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
-from fragprune_plugins.workbench.figures.panels import leave_panels
+from fragprune_plugins.workbench.figures.pictures import leave_panels
 from fragprune_plugins.workbench.figures.wording import PROFILED, describe, nothing_drawn
-from fragprune_plugins.workbench.models.model import load
-from fragprune_plugins.workbench.models.written import writable_folder
+from fragprune_plugins.workbench.models.model import load, writable_folder
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
 
 
@@ -40,7 +39,7 @@ def profile(
         writable_folder(out)
     loaded = load(model, truncation=not no_truncation, device=device)
     if itself:
-        dataset = pictures_of(loaded.untruncated(), scene, cameras, rasterizer)
+        dataset = OwnCameras(scene, cameras).pictures(loaded.untruncated(), rasterizer)
     else:
         remedy = "Name the scene's folder with --data; without photographs, pass --self."
         dataset = load_photographs(photographs_for(model, scene, remedy=remedy)).to(device)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -17,9 +16,8 @@ from torch import Tensor
 from fragprune_plugins.errors import OutputError, UsageError
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.types import View
 from fragprune_plugins.workbench.figures.viewing import overview
-from fragprune_plugins.workbench.scenes.generated import Named, bounds, interpolate
+from fragprune_plugins.workbench.scenes.generated import Named, bounds, interpolate, moved
 from fragprune_plugins.workbench.scenes.pinhole import look_at
 
 _PICTURE: dict[str, Any] = {"width": 1280, "height": 720, "fov_y": 50.0}
@@ -59,7 +57,7 @@ def along(cameras: Named, count: int) -> Named:
         cameras: the given ones. The pictures have the size and lens of the first.
         count: of the result, from the first to the last.
     """
-    views = [_with_lens(view, cameras[0][1]) for _, view in cameras]
+    views = [moved(cameras[0][1], view.viewmatrix, view.campos) for _, view in cameras]
     found = []
     for number in range(count):
         at = number / max(1, count - 1) * (len(views) - 1)
@@ -68,17 +66,6 @@ def along(cameras: Named, count: int) -> Named:
         view = interpolate(views[begin], views[end], at - begin)
         found.append((f"frame{number:04d}", view))
     return found
-
-
-def _with_lens(view: View, other: View) -> View:
-    """A view with another one's lens and picture."""
-    lens = torch.linalg.solve(other.viewmatrix.double(), other.projmatrix.double())
-    return replace(
-        other,
-        viewmatrix=view.viewmatrix,
-        projmatrix=(view.viewmatrix.double() @ lens).to(view.projmatrix),
-        campos=view.campos,
-    )
 
 
 def require_encoder() -> ModuleType:

@@ -15,8 +15,7 @@ from tqdm import tqdm
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.plugins.hooks import thresholds_for
-from fragprune_plugins.types import RasterInputs, RasterOutputs
+from fragprune_plugins.types import RasterOutputs
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import (
     cameras_of,
@@ -29,12 +28,11 @@ from fragprune_plugins.workbench.commands.options import (
     SceneOptions,
     require_several,
 )
-from fragprune_plugins.workbench.distributed.processes import part_of
-from fragprune_plugins.workbench.distributed.sharded import ShardedEngine
+from fragprune_plugins.workbench.distributed import ShardedEngine, part_of
+from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.figures.pictures import save_image, stems
 from fragprune_plugins.workbench.figures.wording import nothing_drawn
-from fragprune_plugins.workbench.models.model import load
-from fragprune_plugins.workbench.models.written import writable_folder
+from fragprune_plugins.workbench.models.model import load, writable_folder
 from fragprune_plugins.workbench.ranks import Ranks, joined
 from fragprune_plugins.workbench.render import filming
 from fragprune_plugins.workbench.scenes.cameras import divided, load_cameras
@@ -172,17 +170,13 @@ class _Drawing:
     ) -> None:
         self.fragments: dict[int, float] = {}
         self._named, self._device, self._ranks = named, device, ranks
-        self._model = part_of(whole, ranks, device) if shard else whole
-        self._splats = self._model.splats()
+        self._candidate = Candidate(part_of(whole, ranks, device) if shard else whole)
         self._engine = ShardedEngine(engine, ranks) if shard else engine
 
     @torch.no_grad()
     def draw(self, index: int) -> RasterOutputs:
         view = self._named[index][1].to(self._device)
-        rules = self._model.rules
-        inputs = RasterInputs(view, self._splats, counts=False, planes=(), **rules)
-        thresholds = thresholds_for(inputs, self._model.thresholds)
-        outputs = self._engine.rasterize(inputs, thresholds)
+        outputs = self._candidate.draw(self._engine, view)
         self.fragments[index] = float(outputs.fragments_per_pixel)
         return outputs
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,7 @@ from PIL import Image, ImageDraw, ImageFont
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.learning.stage2 import evenly
 from fragprune_plugins.workbench.figures import page
+from fragprune_plugins.workbench.figures.evaluate import Candidate, enlarged
 from fragprune_plugins.workbench.figures.pictures import save_image, save_map, stems
 from fragprune_plugins.workbench.figures.wording import measured_with, tabulate
 
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from fragprune_plugins.engines import Engine
-    from fragprune_plugins.workbench.figures.evaluate import Candidate
     from fragprune_plugins.workbench.scenes.dataset import Shot
 
 TEMPLATE = Path(__file__).with_name("report.html")
@@ -92,19 +92,9 @@ def compose(
         values: title; facts, (number, words) of each; quote, a sentence; notes; table; plots,
             (heading, file) of each; others, with heading, sentence and table; settings, a table.
     """
-    shown = drawn or Drawn((), "", 1.0, 1.0)
-    return page.render(
-        template,
-        TEMPLATE.parent,
-        source=source,
-        names=NAMES,
-        labels=labels,
-        views=shown.views,
-        target=shown.target,
-        most_fragments=shown.most_fragments,
-        most_error=shown.most_error,
-        **values,
-    )
+    shown = vars(drawn or Drawn((), "", 1.0, 1.0))
+    values |= shown | {"source": source, "names": NAMES, "labels": labels}
+    return page.render(template, TEMPLATE.parent, **values)
 
 
 def draw_views(
@@ -126,20 +116,18 @@ def draw_views(
         enlarge: how many times as wide and high as the photograph both models are drawn.
     """
 
-    models = [(original, original.model.splats()), (pruned, pruned.model.splats())]
     chosen = [shot.to(original.model.xyz.device) for shot in evenly(shots, SHOWN)]
     names = stems([shot.name for shot in chosen])
     maps: dict[str, dict[str, Tensor]] = {"fragments": {}, "error": {}}
     views = []
     for name, shot in zip(names, chosen, strict=True):
-        size = shot.view.width, shot.view.height
-        large = replace(shot.view, width=enlarge * size[0], height=enlarge * size[1])
+        size, large = (shot.view.width, shot.view.height), enlarged(shot.view, enlarge)
         save_image(folder / f"{name}_photograph.png", shot.image)
         per_pixel = []
-        for model, (each, splats) in zip(NAMES, models, strict=True):
+        for model, each in zip(NAMES, (original, pruned), strict=True):
             with torch.no_grad():
-                out = each.draw(engine, large, splats, counts=True)
-                image = out.image if enlarge == 1 else each.draw(engine, shot.view, splats).image
+                out = each.draw(engine, large, counts=True)
+                image = out.image if enlarge == 1 else each.draw(engine, shot.view).image
             assert out.fragments is not None
             save_image(folder / f"{name}_{model}.png", out.image)
             error = shot.looked_at(image).clamp(0, 1) - shot.image.clamp(0, 1)

@@ -1,10 +1,14 @@
-"""Runs a host's command, and measures what stage 2 did on the views that the host holds out."""
+"""Runs a host's command, and measures what stage 2 did on the views that the host holds out.
+
+Between the stages it looks whether the model knows its photographs by heart.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import logging
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +18,7 @@ from fragprune_plugins.errors import FragpruneError
 from fragprune_plugins.files import records
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.injection import launch
+from fragprune_plugins.injection.options import Found
 from fragprune_plugins.injection.process import current_gpu
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.workbench.commands.command import JSON, Report
@@ -21,6 +26,7 @@ from fragprune_plugins.workbench.commands.logs import Bar, logging_steps
 from fragprune_plugins.workbench.commands.opening import bound_threads, open_engine
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
+from fragprune_plugins.workbench.figures.recorded import Recorded
 from fragprune_plugins.workbench.figures.wording import (
     IS_CONTROL,
     begun,
@@ -31,10 +37,13 @@ from fragprune_plugins.workbench.figures.wording import (
     next_steps,
     outcome,
 )
-from fragprune_plugins.workbench.finetune.trial import Trial
+from fragprune_plugins.workbench.finetune.trial import Trial, tried
 from fragprune_plugins.workbench.models.model import load
-from fragprune_plugins.workbench.run.looking import Looking
+from fragprune_plugins.workbench.pruning import best, removal_error
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
+from fragprune_plugins.workbench.scenes.generated import views_near
+
+log = logging.getLogger("fragprune")
 
 _WHERE = {"joint": "inside the training"}
 _CONTROL = (
@@ -88,7 +97,8 @@ def run(
                 not_compared = error
     data = _figures(summary, settings, looking.trial, before, after, not_compared)
     if summary.steps and summary.model_after:
-        more = {"curves": summary.curves, "photographs": photographs}
+        read = photographs and photographs.as_dict()
+        more = {"curves": summary.curves, "photographs": read}
         records.leave(summary.model_after, "run", data | more)
     return Report(data, _describe(summary, data, not_compared))
 
@@ -142,23 +152,18 @@ def _text(path: Path | None) -> str | None:
     return None if path is None else str(path)
 
 
-def photographs_of(summary: launch.RunSummary) -> dict[str, Any] | None:
-    """The record's "photographs": how to read the host's data and draw its models.
+def photographs_of(summary: launch.RunSummary) -> Recorded | None:
+    """How to read the host's data and draw its models; None if they cannot be measured.
 
-    None if the models cannot be measured. Joint learning leaves one model.
+    Joint learning leaves one model.
     """
-    left = [path for path in (summary.model_before, summary.model_after) if path]
     if not summary.photographs:
         return None
-    return {
-        **summary.photographs.as_dict(),
-        "models": [str(path.resolve()) for path in left],
-        "filtered": True,
-        "drawing": summary.drawing,
-    }
+    left = tuple(path for path in (summary.model_before, summary.model_after) if path)
+    return Recorded(summary.photographs, left, filtered=True, drawing=summary.drawing)
 
 
-def measure_models(photographs: dict[str, Any], engine: EngineOptions) -> list[dict[str, Any]]:
+def measure_models(read: Recorded, engine: EngineOptions) -> list[dict[str, Any]]:
     """Measure the models on held-out views, on the host's device if an engine can draw there.
 
     Returns:
@@ -166,9 +171,9 @@ def measure_models(photographs: dict[str, Any], engine: EngineOptions) -> list[d
     """
     device = "cpu" if engine.device == "cpu" else "auto"
     rasterizer, where = open_engine(EngineOptions(engine.name, device))
-    dataset = load_photographs(Photographs.from_dict(photographs))
-    models = [load(path, filtered=True, device=where) for path in photographs["models"]]
-    candidates = [Candidate(model, photographs["drawing"]) for model in models]
+    dataset = load_photographs(read.photographs)
+    models = [load(path, filtered=read.filtered, device=where) for path in read.models]
+    candidates = [Candidate(model, read.drawing) for model in models]
     return measure_all(candidates, dataset.test, engine=rasterizer)
 
 
@@ -230,3 +235,34 @@ def _viewable(model: Path) -> bool:
     except FragpruneError:
         return False
     return True
+
+
+@dataclass
+class Looking:
+    """What ``RunOptions.look`` calls.
+
+    Attributes:
+        engine: draws.
+        trial: what was found; None before, and where nothing could be tried.
+    """
+
+    engine: EngineOptions
+    trial: Trial | None = None
+
+    def __call__(self, ply: Path, photographs: Photographs, settings: Settings) -> Found:
+        """Make the trial of ``fragprune finetune``, and score the Gaussians as it does."""
+        try:
+            return self._look(ply, photographs, settings)
+        except FragpruneError as error:  # the host may read and draw more than we do
+            log.warning("not tried whether it knows its photographs by heart, because of %s", error)
+            return Found(settings)
+
+    def _look(self, ply: Path, photographs: Photographs, settings: Settings) -> Found:
+        engine, device = open_engine(self.engine)
+        model, dataset = load(ply, device=device), load_photographs(photographs).to(device)
+        trial, kept = tried(model, dataset, settings, engine=engine, say=log.info), None
+        if isinstance(trial.keep, float):
+            views = views_near(dataset.train, seed=settings.seed)
+            kept = best(removal_error(model, model.falloff, views, engine), trial.keep).cpu()
+        self.trial = trial
+        return Found(trial.settings, kept)

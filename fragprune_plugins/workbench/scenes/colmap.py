@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from fragprune_plugins.errors import DatasetError
@@ -30,34 +31,24 @@ _DOOR = Door(
 
 _NAME_MAX = 4096  # bytes of an image's name
 
-# COLMAP's numbers for camera models, src/colmap/sensor/models.h, with their parameter counts.
+# COLMAP's camera models by their number, src/colmap/sensor/models.h: how many focal lengths, and
+# how many parameters after cx, cy. These are in OpenCV's order: k1, k2, p1, p2, k3, k4, k5, k6; of
+# a fisheye k1, k2, k3, k4.
 _MODELS = {
-    0: ("SIMPLE_PINHOLE", 3),
-    1: ("PINHOLE", 4),
-    2: ("SIMPLE_RADIAL", 4),
-    3: ("RADIAL", 5),
-    4: ("OPENCV", 8),
-    5: ("OPENCV_FISHEYE", 8),
-    6: ("FULL_OPENCV", 12),
-    7: ("FOV", 5),
-    8: ("SIMPLE_RADIAL_FISHEYE", 4),
-    9: ("RADIAL_FISHEYE", 5),
-    10: ("THIN_PRISM_FISHEYE", 12),
+    0: ("SIMPLE_PINHOLE", 1, 0),
+    1: ("PINHOLE", 2, 0),
+    2: ("SIMPLE_RADIAL", 1, 1),
+    3: ("RADIAL", 1, 2),
+    4: ("OPENCV", 2, 4),
+    5: ("OPENCV_FISHEYE", 2, 4),
+    6: ("FULL_OPENCV", 2, 8),
+    7: ("FOV", 2, 1),
+    8: ("SIMPLE_RADIAL_FISHEYE", 1, 1),
+    9: ("RADIAL_FISHEYE", 1, 2),
+    10: ("THIN_PRISM_FISHEYE", 2, 8),
 }
-
-# The models that OpenCV can straighten: how many focal lengths, and where in OpenCV's order
-# (k1, k2, p1, p2, k3, k4, k5, k6; of a fisheye k1, k2, k3, k4) the parameters after cx, cy belong.
-_OPENCV: dict[str, tuple[int, tuple[int, ...]]] = {
-    "SIMPLE_PINHOLE": (1, ()),
-    "PINHOLE": (2, ()),
-    "SIMPLE_RADIAL": (1, (0,)),
-    "RADIAL": (1, (0, 1)),
-    "OPENCV": (2, (0, 1, 2, 3)),
-    "FULL_OPENCV": (2, (0, 1, 2, 3, 4, 5, 6, 7)),
-    "OPENCV_FISHEYE": (2, (0, 1, 2, 3)),
-    "SIMPLE_RADIAL_FISHEYE": (1, (0,)),
-    "RADIAL_FISHEYE": (1, (0, 1)),
-}
+_FOREIGN = ("FOV", "THIN_PRISM_FISHEYE")  # OpenCV cannot straighten them
+_OPENCV = {name: counts for name, *counts in _MODELS.values() if name not in _FOREIGN}
 
 Pose = tuple[str, int, tuple[float, ...], tuple[float, ...]]
 """name, camera id, quaternion w x y z, translation"""
@@ -132,18 +123,10 @@ def _mask_path(masks: Path, name: str) -> Path | None:
 
 def _rotation(quaternion: tuple[float, ...]) -> Tensor:
     """(3, 3) float64 rotation from a quaternion w, x, y, z of any length but 0."""
-    q = torch.tensor(quaternion, dtype=torch.float64)
-    if not 0 < float(q.norm()) < math.inf:
+    if not 0 < math.hypot(*quaternion) < math.inf:
         raise ValueError(f"the quaternion {list(quaternion)}, which is no rotation")
-    w, x, y, z = (q / q.norm()).tolist()
-    return torch.tensor(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ],
-        dtype=torch.float64,
-    )
+    w, *xyz = quaternion
+    return torch.from_numpy(Rotation.from_quat([*xyz, w]).as_matrix())
 
 
 def _lens(model: str, width: int, height: int, values: Sequence[float]) -> Lens:
@@ -155,14 +138,13 @@ def _lens(model: str, width: int, height: int, values: Sequence[float]) -> Lens:
             f"one of {', '.join(_OPENCV)}",
             "Undistort first: colmap image_undistorter.",
         )
-    focals, places = _OPENCV[model]
-    f, rest = values[:focals], values[focals + 2 :]
-    cx, cy = values[focals : focals + 2]
+    focals, bends = _OPENCV[model]
+    if len(values) != focals + 2 + bends:
+        raise ValueError(f"{len(values)} parameters of {model}, not {focals + 2 + bends}")
+    cx, cy, *bend = values[focals:]
     fisheye = model.endswith("FISHEYE")
-    bend = [0.0] * (4 if fisheye else 8)
-    for place, value in zip(places, rest, strict=True):
-        bend[place] = value
-    return Lens(width, height, f[0], f[-1], cx, cy, tuple(bend), fisheye)
+    bend += [0.0] * ((4 if fisheye else 8) - bends)
+    return Lens(width, height, values[0], values[focals - 1], cx, cy, tuple(bend), fisheye)
 
 
 def _text_lines(reading: Reading) -> Iterator[str]:
@@ -209,8 +191,9 @@ def _cameras_binary(reading: Reading) -> Iterator[tuple[int, Lens]]:
         number, code, width, height = _unpack(reading, "iiQQ")
         if code not in _MODELS:
             raise ValueError(f"camera model number {code}")
-        model, count = _MODELS[code]
-        yield number, _lens(model, width, height, _unpack(reading, f"{count}d"))
+        model, focals, bends = _MODELS[code]
+        values = _unpack(reading, f"{focals + 2 + bends}d")
+        yield number, _lens(model, width, height, values)
 
 
 def _images_binary(reading: Reading) -> Iterator[Pose]:

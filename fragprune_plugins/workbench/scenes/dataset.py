@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Sequence
+import weakref
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
@@ -15,17 +16,18 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.errors import DatasetError, printable
+from fragprune_plugins.files.reading import MEBIBYTE
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.types import View, one_line
 from fragprune_plugins.workbench.scenes import colmap, transforms
 from fragprune_plugins.workbench.scenes.images import SUFFIXES, image_size, opened
 from fragprune_plugins.workbench.scenes.lenses import Lens
-from fragprune_plugins.workbench.scenes.memory import PICTURES, Slot
 from fragprune_plugins.workbench.scenes.pinhole import Camera
 from fragprune_plugins.workbench.scenes.posed import Posed
 
 if TYPE_CHECKING:
     from PIL.Image import Image
+    from torch import Tensor
 
     from fragprune_plugins.workbench.scenes.lenses import Pixels
 
@@ -74,6 +76,50 @@ class Shot:
         if self.view.background.device == torch.device(device):
             return self
         return replace(self, view=self.view.to(device))
+
+
+ROOM = 4096 * MEBIBYTE
+"""Bytes of pixels that are kept: 170 photographs of 3840x2160 pixels."""
+
+
+class Slot:
+    """The place of one photograph's pixels, shared by its copies on other devices."""
+
+
+class Pictures:
+    """Pixels in slots; those that were not used for longest go when the room is full.
+
+    Args:
+        room: bytes to keep. One picture is kept, whatever its size.
+    """
+
+    def __init__(self, room: int) -> None:
+        self.room = room
+        self._held: weakref.WeakKeyDictionary[Slot, Tensor] = weakref.WeakKeyDictionary()
+
+    @property
+    def size(self) -> int:
+        """Bytes of all pixels that are kept."""
+        return sum(pixels.numel() for pixels in self._held.values())
+
+    def get(self, slot: Slot, load: Callable[[], Tensor]) -> Tensor:
+        """The slot's pixels, loaded if they are not there."""
+        known = self._held.pop(slot, None)
+        self._held[slot] = pixels = load() if known is None else known  # the last one in the order
+        if known is None:
+            self._make_room()
+        return pixels
+
+    def _make_room(self) -> None:
+        size = self.size
+        *others, _ = list(self._held)
+        for slot in others:
+            if size > self.room:
+                size -= self._held.pop(slot).numel()
+
+
+PICTURES = Pictures(ROOM)
+"""Of the whole process."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,12 +217,7 @@ class Dataset:
 
 def load_photographs(photographs: Photographs) -> Dataset:
     """Load the photographs of a run with ``load_dataset``."""
-    return load_dataset(
-        photographs.folder,
-        resolution=photographs.resolution,
-        white_background=photographs.white_background,
-        images=photographs.images,
-    )
+    return load_dataset(**vars(photographs))
 
 
 def load_dataset(

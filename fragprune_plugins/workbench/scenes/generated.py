@@ -1,25 +1,30 @@
 """Cameras that nobody took a photograph with: around a splat, inside of it, near given ones.
 
 They are the same for the same seed. Cameras around a splat suit an object. Inside one they need
-free space, which the file does not record: ``audit.placing`` estimates it.
+free space, which the file does not record: ``audit.placing`` estimates it. A model's own pictures
+from them, what it showed as it came in, serve instead of photographs.
 """
 
 from __future__ import annotations
 
 import math
 import random
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import TypeVar
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import ClassVar, TypeVar
 
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.types import View
-from fragprune_plugins.workbench.scenes.dataset import Shot
+from fragprune_plugins.plugins.hooks import engine_for
+from fragprune_plugins.types import RasterInputs, View, one_line
+from fragprune_plugins.workbench.models import model as models
+from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 from fragprune_plugins.workbench.scenes.pinhole import look_at
 from fragprune_plugins.workbench.scenes.posed import HOLD_OUT
 
@@ -78,11 +83,8 @@ def around(
     centre, radius = bounds(splat)
     views = []
     for number in range(count):
-        rise, turn = 1 - (2 * number + 1) / count, number * _GOLDEN_ANGLE
-        level = math.sqrt(1 - rise * rise)
-        away = torch.tensor([level * math.cos(turn), rise, level * math.sin(turn)])
         far = radius / math.sin(math.radians(_FOV) / 2) * stream.uniform(*_NEARER)
-        eye = centre + far * away
+        eye = centre + far * _direction(number, count)
         view = look_at(eye, centre, width=pixels, height=pixels, fov_y=_FOV, background=background)
         views.append((f"around{number:03d}", view))
     return views
@@ -97,13 +99,18 @@ def within(places: Sequence[Tensor], count: int, *, pixels: int = 800) -> Named:
     """
     views = []
     for number in range(count):
-        rise, turn = _LEVEL * (1 - (2 * number + 1) / count), number * _GOLDEN_ANGLE
-        level = math.sqrt(1 - rise * rise)
-        ahead = torch.tensor([level * math.cos(turn), rise, level * math.sin(turn)])
         eye = places[number % len(places)].detach().float().cpu()
-        view = look_at(eye, eye + ahead, width=pixels, height=pixels, fov_y=_WIDE)
+        ahead = eye + _direction(number, count, _LEVEL)
+        view = look_at(eye, ahead, width=pixels, height=pixels, fov_y=_WIDE)
         views.append((f"within{number:03d}", view))
     return views
+
+
+def _direction(number: int, count: int, steepest: float = 1.0) -> Tensor:
+    """(3,) one of many directions that are evenly spread over a sphere, or the middle of it."""
+    rise, turn = steepest * (1 - (2 * number + 1) / count), number * _GOLDEN_ANGLE
+    level = math.sqrt(1 - rise * rise)
+    return torch.tensor([level * math.cos(turn), rise, level * math.sin(turn)])
 
 
 def between(cameras: Named, *, seed: int = 0) -> Named:
@@ -191,12 +198,18 @@ def interpolate(a: View, b: View, t: float) -> View:
     view = torch.eye(4, dtype=torch.float64)
     view[:3, :3] = rotation.T
     view[3, :3] = -rotation @ centre
-    lens = torch.linalg.solve(one, a.projmatrix.double().cpu())  # camera to clip
+    return moved(a, view, centre)
+
+
+def moved(view: View, viewmatrix: Tensor, campos: Tensor) -> View:
+    """The view with its lens and picture, from where another pose is."""
+    lens = torch.linalg.solve(view.viewmatrix.double(), view.projmatrix.double())  # camera to clip
+    matrix = viewmatrix.to(lens)
     return replace(
-        a,
-        viewmatrix=view.to(a.viewmatrix),
-        projmatrix=(view @ lens).to(a.projmatrix),
-        campos=centre.to(a.campos),
+        view,
+        viewmatrix=matrix.to(view.viewmatrix),
+        projmatrix=(matrix @ lens).to(view.projmatrix),
+        campos=campos.to(view.campos),
     )
 
 
@@ -215,3 +228,73 @@ def hold_out(items: Sequence[Item]) -> tuple[list[Item], list[Item]]:
         )
     rest = [item for index, item in enumerate(items) if index % HOLD_OUT]
     return rest, list(items[::HOLD_OUT])
+
+
+@dataclass(frozen=True, eq=False)
+class OwnPicture(Shot):
+    """A camera, and the picture that a model gives there.
+
+    Attributes:
+        draw: draws it, (3, H, W). It is asked at every use: a forward pass more in a step costs
+            less than to hold the pictures of hundreds of views, and rounds nothing.
+    """
+
+    target: ClassVar[str] = "itself"
+
+    draw: Callable[[View], Tensor]
+
+    __repr__ = one_line
+
+    @property
+    def image(self) -> Tensor:
+        """(3, H, W) RGB on the view's device, not clamped."""
+        return self.draw(self.view)
+
+
+def own_pictures(
+    model: Model | models.Trained | str | Path,
+    cameras: Named | None = None,
+    held_out: Named | None = None,
+    *,
+    engine: str | Engine = "auto",
+    seed: int = 0,
+) -> Dataset:
+    """A model's own pictures, to learn its thresholds from without photographs.
+
+    It is drawn as it came in: untruncated, or truncated by the thresholds that it has.
+
+    Args:
+        model: what ``load`` gave, the result of a training, or a file. It is kept.
+        cameras: named views to learn from; views between near ones are added. None takes cameras
+            all around the splat, which suit an object but no scene seen from within.
+        held_out: named views for the figures; every eighth of ``cameras`` when None.
+        engine: a name or an engine.
+        seed: of what is generated.
+
+    Raises:
+        DatasetError: fewer than two cameras.
+        EngineError: no such engine here.
+    """
+    model = models.of(model)
+    draw = _drawing(model, engine)
+    views = around(model, seed=seed) if cameras is None else cameras
+    if held_out is None:
+        views, held_out = hold_out(views)
+    train, test = (
+        [OwnPicture(name, view, draw) for name, view in part]
+        for part in ([*views, *between(views, seed=seed)], held_out)
+    )
+    return Dataset(train, test).to(model.device)
+
+
+def _drawing(model: Model, engine: str | Engine) -> Callable[[View], Tensor]:
+    """Draws a model as it is now, (3, H, W)."""
+    drawer = engine_for(engine, model.device) if isinstance(engine, str) else engine
+    splats, thresholds = model.splats(), model.falloff
+
+    @torch.no_grad()
+    def draw(view: View) -> Tensor:
+        inputs = RasterInputs(view, splats, planes=(), **model.rules)
+        return drawer.rasterize(inputs, thresholds).image
+
+    return draw

@@ -1,4 +1,7 @@
-"""The files of a viewer: to serve, to write into a folder, or to put into one page."""
+"""The files of a viewer: to serve, to write into a folder, or to put into one page.
+
+It is served to this machine only, and what is not among its files does not exist for it.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +10,15 @@ import contextlib
 import io
 import json
 import re
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import torch
 
@@ -20,11 +28,10 @@ from fragprune_plugins.files.model import Model
 from fragprune_plugins.types import View
 from fragprune_plugins.workbench.figures.page import allowed
 from fragprune_plugins.workbench.figures.pictures import picture
-from fragprune_plugins.workbench.models.written import writable_folder
+from fragprune_plugins.workbench.models.model import writable_folder
 from fragprune_plugins.workbench.scenes.dataset import Shot
 from fragprune_plugins.workbench.scenes.generated import bounds
-from fragprune_plugins.workbench.view.compact import compact
-from fragprune_plugins.workbench.view.packing import pack
+from fragprune_plugins.workbench.view.packing import compact, pack
 
 Site = dict[str, bytes]
 """Names of files, with slashes, and what they hold."""
@@ -82,8 +89,6 @@ def make_site(
     layers: Sequence[Layer],
     cameras: Sequence[Shown],
     start: View,
-    *,
-    up: Sequence[float] = (0.0, -1.0, 0.0),
 ) -> Site:
     """All files of a viewer.
 
@@ -91,7 +96,6 @@ def make_site(
         layers: one or two; the first is on the left.
         cameras: to choose from; may be none.
         start: the first camera; its background is the page's.
-        up: (3,) what is up in the world.
 
     Raises:
         DatasetError: a photograph cannot be read.
@@ -117,7 +121,7 @@ def make_site(
         "cameras": listed,
         "start": listed[0] if cameras and start is cameras[0].view else camera(start),
         "background": start.background.tolist(),
-        "up": list(up),
+        "up": [0.0, -1.0, 0.0],  # as in COLMAP's worlds
         "centre": centre.tolist(),
         "radius": radius,
     }
@@ -226,3 +230,86 @@ def _text(name: str, data: bytes) -> str:
     if name.endswith(".jpg"):
         return base64.b64encode(data).decode()
     return base64.b85encode(data).translate(_SAFE).decode()
+
+
+HOST = "127.0.0.1"
+
+_KINDS = {
+    "html": "text/html; charset=utf-8",
+    "css": "text/css; charset=utf-8",
+    "js": "text/javascript; charset=utf-8",
+    "json": "application/json",
+    "jpg": "image/jpeg",
+}
+
+
+def open_server(site: Site, port: int = 0) -> ThreadingHTTPServer:
+    """A server of these files, bound to 127.0.0.1; ``serve_forever`` runs it.
+
+    Args:
+        port: 0 for any free one.
+
+    Raises:
+        OutputError: the port cannot be had.
+    """
+    try:
+        return _Server((HOST, port), partial(_Handler, site))
+    except OSError as error:
+        raise OutputError(
+            f"{HOST}:{port}", error.strerror or str(error), "a free port", "Leave out --port."
+        ) from error
+
+
+def address(server: ThreadingHTTPServer) -> str:
+    """Where a browser on this machine finds the viewer."""
+    return f"http://{HOST}:{server.server_port}/"
+
+
+class _Server(ThreadingHTTPServer):
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Say nothing of a browser that goes away before it has read its answer."""
+        if not isinstance(sys.exc_info()[1], ConnectionError):
+            super().handle_error(request, client_address)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+
+    def __init__(self, site: Site, *words: Any) -> None:
+        self.site = site
+        super().__init__(*words)
+
+    def do_GET(self) -> None:
+        """Answer with a file."""
+        self._answer(with_body=True)
+
+    def do_HEAD(self) -> None:
+        """Answer as to GET, without the file."""
+        self._answer(with_body=False)
+
+    def _answer(self, *, with_body: bool) -> None:
+        port = self.connection.getsockname()[1]
+        if self.headers.get("Host") not in (f"{HOST}:{port}", f"localhost:{port}"):
+            # A page of another site that has its name point here may not read the model.
+            self.send_error(HTTPStatus.FORBIDDEN)
+            return
+        name = unquote(self.path.partition("?")[0])[1:] or "index.html"
+        content = self.site.get(name)
+        if content is None:
+            self.send_error(HTTPStatus.NOT_FOUND)
+            return
+        self.send_response(HTTPStatus.OK)
+        kind = _KINDS.get(name.rpartition(".")[2], "application/octet-stream")
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(content)))
+        self.send_header("Cache-Control", "no-store")
+        # The page has a policy of its own; only a header can say who may frame it.
+        self.send_header("Content-Security-Policy", "frame-ancestors 'none'")
+        self.send_header("X-Content-Type-Options", "nosniff")
+        self.send_header("Cross-Origin-Resource-Policy", "same-origin")
+        self.end_headers()
+        if with_body:
+            self.wfile.write(content)
+
+    def log_message(self, *words: Any) -> None:
+        """Say nothing: the terminal is the command's."""

@@ -16,18 +16,18 @@ from fragprune_plugins.files.reading import lies_in
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import cameras_of
 from fragprune_plugins.workbench.figures.viewing import overview
-from fragprune_plugins.workbench.models.model import load
-from fragprune_plugins.workbench.models.written import writable_folder
+from fragprune_plugins.workbench.models.model import load, writable_folder
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
 from fragprune_plugins.workbench.scenes.dataset import load_dataset
 from fragprune_plugins.workbench.scenes.output import output_folder
-from fragprune_plugins.workbench.view.server import address, open_server
 from fragprune_plugins.workbench.view.site import (
     Layer,
     Shown,
     Site,
+    address,
     compacted,
     make_site,
+    open_server,
     save_site,
     single_page,
 )

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fragprune_plugins.files.atomic import replacing
-from fragprune_plugins.workbench.models.written import writable_folder
+from fragprune_plugins.workbench.models.model import writable_folder
 from lab.room.furniture import CENTRE, furnish
 from lab.room.textures import displayed
 from lab.room.tracer import FAR, Array, World, times

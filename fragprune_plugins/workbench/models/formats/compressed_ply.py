@@ -23,6 +23,8 @@ from fragprune_plugins.workbench.models.formats.values import (
     opacities_of,
     quaternions_of,
     splat_of,
+    with_largest,
+    without_largest,
 )
 
 _CHUNK = 256
@@ -143,19 +145,11 @@ def _packed(fractions: npt.NDArray[Any], bits: tuple[int, ...]) -> npt.NDArray[n
 def _rotations(packed: npt.NDArray[np.uint32]) -> npt.NDArray[Any]:
     """Quaternions from three components of 10 bits and the index of the largest."""
     three = (_unpacked(packed & np.uint32((1 << 30) - 1), (10, 10, 10)) - 0.5) / _HALF_SQRT2
-    largest = packed >> np.uint32(30)
-    full = np.zeros((len(packed), 4))
-    others = np.arange(4)[None] != largest[:, None]
-    full[others] = three.ravel()
-    full[~others] = np.sqrt(np.maximum(0, 1 - (three**2).sum(axis=1)))
-    return full
+    return with_largest(packed >> np.uint32(30), three)
 
 
 def _packed_rotations(quaternions: npt.NDArray[Any]) -> npt.NDArray[np.uint32]:
-    largest = np.abs(quaternions).argmax(axis=1)
-    sign = np.where(quaternions[np.arange(len(quaternions)), largest] < 0, -1, 1)
-    others = np.arange(4)[None] != largest[:, None]
-    three = (quaternions * sign[:, None])[others].reshape(-1, 3)
+    largest, three = without_largest(quaternions)
     packed = _packed(three * _HALF_SQRT2 + 0.5, (10, 10, 10))
     result: npt.NDArray[np.uint32] = packed | (largest.astype(np.uint32) << np.uint32(30))
     return result

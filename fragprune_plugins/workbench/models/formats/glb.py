@@ -70,7 +70,8 @@ def read(reading: Reading) -> Model:
     xyz = column("POSITION", 3)
     names = [(f"{BASE}:ROTATION", 4), (f"{BASE}:SCALE", 3), (f"{BASE}:OPACITY", 1)]
     parts = [column(*each) for each in names] + [column(name, 3) for name in sh]
-    extension = _extension(primitive)
+    ours: dict[str, Any] = primitive["extensions"][BASE].get("extensions", {})
+    extension = ours.get(CUTOFF)
     cut = extension is not None and ("stop" not in extension or _THRESHOLD in attributes)
     cutoff = column(_THRESHOLD, 1)[:, 0] if cut else None
     reading.place = ""
@@ -111,12 +112,6 @@ def _primitive(scene: dict[str, Any]) -> dict[str, Any]:
     if any(moved & each.keys() for each in scene.get("nodes", [])):
         raise ValueError("nodes that move the splats, where we read those that stay")
     return primitive
-
-
-def _extension(primitive: dict[str, Any]) -> dict[str, Any] | None:
-    """Ours; None if the primitive has none."""
-    found: dict[str, Any] | None = primitive["extensions"][BASE].get("extensions", {}).get(CUTOFF)
-    return found
 
 
 def _accessor(

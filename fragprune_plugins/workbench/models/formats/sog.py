@@ -39,6 +39,8 @@ from fragprune_plugins.workbench.models.formats.values import (
     rules_of,
     splat_of,
     take,
+    with_largest,
+    without_largest,
 )
 
 EXTRA = "fragprune_cutoff"
@@ -170,12 +172,7 @@ def _rotations(texels: Bytes) -> npt.NDArray[Any]:
     largest = texels[:, 3].astype(np.int64) - 252
     if (largest < 0).any():
         raise ValueError("rotations without a largest component")
-    three = (texels[:, :3] / 255 * 2 - 1) / _SQRT2
-    full = np.zeros((len(texels), 4))
-    others = np.arange(4)[None] != largest[:, None]
-    full[others] = three.ravel()
-    full[~others] = np.sqrt(np.maximum(0, 1 - (three**2).sum(axis=1)))
-    return full
+    return with_largest(largest, (texels[:, :3] / 255 * 2 - 1) / _SQRT2)
 
 
 def write(file: BinaryIO, splat: Model) -> None:
@@ -249,10 +246,7 @@ def write(file: BinaryIO, splat: Model) -> None:
 
 
 def _packed_rotations(quaternions: npt.NDArray[Any]) -> Bytes:
-    largest = np.abs(quaternions).argmax(axis=1)
-    sign = np.where(quaternions[np.arange(len(quaternions)), largest] < 0, -1, 1)
-    others = np.arange(4)[None] != largest[:, None]
-    three = (quaternions * sign[:, None])[others].reshape(-1, 3)
+    largest, three = without_largest(quaternions)
     packed = byte(255 * (three * _SQRT2 * 0.5 + 0.5))
     return np.concatenate([packed, (252 + largest).astype(np.uint8)[:, None]], axis=1)
 

@@ -34,6 +34,7 @@ from fragprune_plugins.workbench.models.formats.values import (
     splat_of,
     take,
     turned,
+    with_largest,
 )
 
 if sys.version_info >= (3, 14):
@@ -72,13 +73,13 @@ def read(reading: Reading) -> Model:
     reading.file.seek(0)
     if magic[:2] == b"\x1f\x8b":
         with gzip.GzipFile(fileobj=reading.file) as stream:
-            header = _parse(take(stream, 16), reading.size)
+            header = _Header(take(stream, 16), reading.size)
             if header.version not in (2, 3):
                 raise ValueError(f"version {header.version} of SPZ in gzip")
             parts = [take(stream, size) for size in header.sizes]
             records = _records(stream.read(header.count + 4096)) if header.extended else {}
     else:
-        header = _parse(reading.take(16), reading.size)
+        header = _Header(reading.take(16), reading.size)
         if header.version != 4:
             raise ValueError(f"version {header.version} of SPZ")
         (start,) = struct.unpack("<I", reading.take(4))
@@ -101,7 +102,7 @@ def read(reading: Reading) -> Model:
 class _Header:
     """What a header says: version, number of Gaussians, SH degree, and the sizes of the parts."""
 
-    def __init__(self, data: bytes) -> None:
+    def __init__(self, data: bytes, size: int) -> None:
         fields = _HEADER.unpack(data)
         magic, self.version, self.count, degree, self.bits, flags, self.streams = fields
         if magic != _MAGIC:
@@ -113,12 +114,7 @@ class _Header:
         self.extended, self.antialiased = bool(flags & _EXTENDED), bool(flags & _ANTIALIASED)
         widths = (9, 1, 3, 3, 3 if self.version == 2 else 4, 3 * _COEFFICIENTS[degree])
         self.sizes = [self.count * width for width in widths]
-
-
-def _parse(data: bytes, size: int) -> _Header:
-    header = _Header(data)
-    expect_plausible(header.count, size)
-    return header
+        expect_plausible(self.count, size)
 
 
 def _streams(reading: Reading, header: _Header) -> list[bytes]:
@@ -196,11 +192,7 @@ def _smallest_three(data: Bytes) -> npt.NDArray[Any]:
     largest = packed >> 30
     fields = np.stack([packed >> 20, packed >> 10, packed], axis=1) & 0x3FF
     three = _SQRT_HALF * (fields & 0x1FF) / 511 * np.where(fields & 0x200, -1, 1)
-    xyzw = np.zeros((len(packed), 4))
-    others = np.arange(4)[None] != largest[:, None]
-    xyzw[others] = three.ravel()
-    xyzw[~others] = np.sqrt(np.maximum(0, 1 - (three**2).sum(axis=1)))
-    return xyzw[:, [3, 0, 1, 2]]
+    return with_largest(largest, three)[:, [3, 0, 1, 2]]
 
 
 def write(file: BinaryIO, splat: Model) -> None:

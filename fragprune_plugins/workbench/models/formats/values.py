@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -123,6 +124,24 @@ def quaternions_of(splat: Model) -> Floats:
     return array(torch.nn.functional.normalize(splat.rotation))
 
 
+def without_largest(quaternions: Floats) -> tuple[npt.NDArray[np.int64], Floats]:
+    """(N,) which component of (N, 4) is the largest, and (N, 3) the others where it is positive."""
+    largest = np.abs(quaternions).argmax(axis=1)
+    sign = np.where(quaternions[np.arange(len(quaternions)), largest] < 0, -1, 1)
+    others = np.arange(4)[None] != largest[:, None]
+    three: Floats = (quaternions * sign[:, None])[others].reshape(-1, 3)
+    return largest, three
+
+
+def with_largest(largest: npt.NDArray[Any], three: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+    """(N, 4) unit quaternions, from what ``without_largest`` gives."""
+    full = np.zeros((len(three), 4))
+    others = np.arange(4)[None] != largest[:, None]
+    full[others] = three.ravel()
+    full[~others] = np.sqrt(np.maximum(0, 1 - (three**2).sum(axis=1)))
+    return full
+
+
 def byte(values: npt.NDArray[Any]) -> Bytes:
     """Values rounded to 0..255; halves go up."""
     return np.clip(np.floor(values + 0.5), 0, 255).astype(np.uint8)
@@ -155,14 +174,11 @@ def turned(splat: Model, signs: tuple[int, int, int]) -> Model:
     turn = torch.tensor([1, y * z, x * z, x * y], dtype=torch.float32)
     sh = [y, z, x, x * y, y * z, 1, x * z, 1, y, x * y * z, y, z, x, z, x]
     rest = splat.f_rest.shape[1]
-    return Model(
+    return replace(
+        splat,
         xyz=splat.xyz * per_axis,
-        f_dc=splat.f_dc,
         f_rest=splat.f_rest * torch.tensor(sh[:rest], dtype=torch.float32)[None, :, None],
-        opacity=splat.opacity,
-        scaling=splat.scaling,
         rotation=splat.rotation * turn,
-        thresholds=splat.thresholds,
     )
 
 

@@ -1,4 +1,4 @@
-// What a page holds itself: bytes as text, and the tables that compact.py has made small.
+// What a page holds itself: bytes as text, and the tables that packing.py has made small.
 
 const DIGITS = "0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz!#$%.()*+-;,=>?@^_`{|}~";
 

@@ -1,0 +1,229 @@
+"""How processes learn one model: one alone, or several that each hold a copy of it.
+
+Copies sum their gradients, and stay equal to the bit. ``workbench.distributed`` divides a model.
+"""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from itertools import accumulate
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from fragprune_plugins.errors import UsageError
+from fragprune_plugins.learning.pressure import StepViews
+from fragprune_plugins.learning.schedule import Settings, StepPlan
+from fragprune_plugins.learning.stage2 import Stage2
+from fragprune_plugins.learning.waiting import Waiting
+from fragprune_plugins.workbench.goals import Faster
+from fragprune_plugins.workbench.ranks import Ranks, fingerprint
+from fragprune_plugins.workbench.scenes.dataset import Shot
+
+if TYPE_CHECKING:
+    from fragprune_plugins.workbench.finetune.loop import Training
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_COMPARE = 100  # steps from one comparison of copies to the next
+
+
+class SharedStage(Stage2):
+    """Learning of thresholds whose views several processes draw, as if one had drawn them all."""
+
+    _visited = (0, 0)  # how many pictures were known before this step
+
+    def begin(self, opacities: Callable[[], Tensor]) -> StepPlan:
+        """A step begins; see ``Stage2``."""
+        self._visited = len(self._before), len(self._after)
+        return super().begin(opacities)
+
+    def figures(self) -> list[list[float]]:
+        """Of each view drawn in this step that counts, for ``share``.
+
+        Fragments per pixel now and before, what the pressure acts on, and the loss.
+        """
+        return self._views.rows()
+
+    def share(self, views: Sequence[Hashable], figures: Tensor) -> None:
+        """This step's views were drawn by several processes: take over the figures of all.
+
+        Args:
+            views: all of this step, in the same order in every process.
+            figures: (V, 4), the rows that ``figures`` gave in the processes that drew them.
+        """
+        for known, count in zip((self._before, self._after), self._visited, strict=True):
+            for picture in list(known)[count:]:  # the order of what is new must be the same
+                del known[picture]
+        self._views = StepViews(self._views.expected)
+        for view, (drawn, before, pressed, loss) in zip(views, figures, strict=True):
+            picture = view, 0
+            self._before.setdefault(picture, before.reshape(1))
+            if self._open:
+                self._after[picture] = drawn.reshape(1)
+            self._views.draw(drawn, before, pressed)
+            self._views.lose(loss)
+
+
+class Processes:
+    """Processes that each hold the whole model; one alone is the usual case.
+
+    Attributes:
+        first: this process writes files and speaks.
+        several: there are others.
+        divided: other processes hold other Gaussians of the model.
+        may_end: a signal may end the training after this step.
+    """
+
+    divided = False
+    may_end = True
+
+    def __init__(self, ranks: Ranks) -> None:
+        self.ranks, self.first, self.several = ranks, ranks.first, ranks.several
+        self._due = False  # it is time for a checkpoint, some process says
+
+    def expect_able(self, settings: Settings) -> None:
+        """Refuse views that cannot be divided, and times, which others would disturb."""
+        if self.several and isinstance(settings.goal, Faster):
+            raise UsageError(
+                "target time",
+                f"{self.ranks.size} processes, which would disturb each other's measurements",
+                "one process",
+                "Aim for fewer fragments, or start one process.",
+            )
+        if settings.views_per_step % self.ranks.size:
+            raise UsageError(
+                "views per step",
+                f"{settings.views_per_step} for {self.ranks.size} processes",
+                f"a multiple of {self.ranks.size}",
+                "Change --views-per-step.",
+            )
+
+    def agree(self, known: dict[str, Any]) -> None:
+        """Raise RanksError if another process is about to learn something else."""
+        self.ranks.agree(known, "fine-tuning, before its first step")
+
+    def share(self, shots: Sequence[Shot]) -> Sequence[Shot]:
+        """The views of a step that this process draws."""
+        return self.ranks.share(shots)
+
+    @torch.no_grad()
+    def went_backward(self, training: Training, shots: Sequence[Shot], waiting: Waiting) -> None:
+        """Take over from all processes gradients and figures; and whether to end, or to keep.
+
+        Raises:
+            RanksError: another process is gone.
+        """
+        if not self.several:
+            return
+        stage, keeper = training.stage, training.keeper
+        leaves = [*training.parameters().values(), stage.store.logits]
+        due = keeper is not None and keeper.due(training.done + 1)
+        flags = [*(waiting.number == number for number in _SIGNALS), due]
+        rows = stage.figures()
+        table, (*signals, self._due) = self.exchange(leaves, rows, len(shots), flags)
+        if rows:
+            stage.share(shots, table)
+        came = [number for number, some in zip(_SIGNALS, signals, strict=True) if some]
+        self.may_end = bool(came)  # one that comes later waits for the next exchange
+        if came and not waiting.number:
+            signal.raise_signal(came[0])  # it came to another process: all end after this step
+
+    def stepped(self, training: Training) -> None:
+        """Compare all that learns, from time to time; raises RanksError if processes differ."""
+        if training.done % _COMPARE == 0:
+            self.finished(training)
+
+    def finished(self, training: Training) -> None:
+        """Compare all that learns, after the last step; raises RanksError if processes differ."""
+        if self.several:
+            learned = training.parameters() | {"thresholds": training.stage.store.logits}
+            self.compare(learned, training.done)
+
+    def keeps(self, training: Training) -> bool:
+        """Whether it is time for a checkpoint after this step, as all decided in it."""
+        if self.several:
+            return self._due
+        return training.keeper is not None and training.keeper.due(training.done)
+
+    def described(self, configuration: dict[str, Any]) -> dict[str, Any]:
+        """What decides the result, in the words of all processes together."""
+        return configuration
+
+    def total(self, count: int) -> int:
+        """Gaussians of the whole model, from those that this process holds."""
+        return count
+
+    def everywhere(self, rows: Tensor) -> Tensor:
+        """The rows of all Gaussians, in each process."""
+        return rows
+
+    def whole(self, rows: Tensor) -> Tensor:
+        """The rows of all Gaussians, in the first process; there may be none in others."""
+        return rows
+
+    def own(self, rows: Tensor) -> Tensor:
+        """This process' rows, of those of all Gaussians."""
+        return rows
+
+    def exchange(
+        self,
+        leaves: Sequence[Tensor],
+        rows: Sequence[Sequence[float]],
+        views: int,
+        flags: Sequence[bool],
+    ) -> tuple[Tensor, list[bool]]:
+        """Make gradients those of all views of a step; tell each process all figures.
+
+        It is one reduction of one tensor.
+
+        Args:
+            leaves: the tensors that learn. Their gradients are changed in place, and are there
+                afterwards if any process has one.
+            rows: four figures of each view that this process drew.
+            views: how many all processes drew.
+            flags: what this process noticed.
+
+        Returns:
+            (views, 4) figures of all views; and of each flag, whether any process has it.
+
+        Raises:
+            RanksError: another process is gone.
+        """
+        table = leaves[0].new_zeros(views, 4)
+        if rows:
+            table[self.ranks.rank :: self.ranks.size] = table.new_tensor(rows)
+        noticed = table.new_tensor(flags)
+        there = table.new_tensor([leaf.grad is not None for leaf in leaves])
+        told = self._told(leaves)
+        *sums, there, noticed, table = self._summed([*told, there, noticed, table])
+        for leaf, total, some in zip(leaves, sums, there.tolist(), strict=True):
+            leaf.grad = self._gradient(leaf, total) if some else None
+        return table, [some > 0 for some in noticed.tolist()]
+
+    def _told(self, leaves: Sequence[Tensor]) -> list[Tensor]:
+        """What the others are told of each leaf's gradient."""
+        return [torch.zeros_like(each) if each.grad is None else each.grad for each in leaves]
+
+    def _gradient(self, leaf: Tensor, total: Tensor) -> Tensor:
+        """A leaf's gradient, from what all processes told together."""
+        return total
+
+    def _summed(self, parts: Sequence[Tensor]) -> list[Tensor]:
+        flat = torch.cat([part.reshape(-1) for part in parts])
+        self.ranks.sum(flat)
+        ends = accumulate(part.numel() for part in parts)
+        return [
+            flat[end - part.numel() : end].view_as(part)
+            for end, part in zip(ends, parts, strict=True)
+        ]
+
+    def compare(self, tensors: Mapping[str, Tensor], step: int) -> None:
+        """Stop unless all processes hold the same bits.
+
+        Raises:
+            RanksError: they differ.
+        """
+        known = {name: fingerprint(tensor) for name, tensor in tensors.items()}
+        self.ranks.agree(known, f"fine-tuning, after step {step}")
