@@ -387,7 +387,9 @@ def is_rim(value: object) -> bool:
 
 def is_stop(value: object) -> bool:
     """Whether a value can be the ``stop`` of ``RasterInputs``."""
-    return value is None or (isinstance(value, float | int) and TRANSMITTANCE_MIN <= value <= 1)
+    if value is None or isinstance(value, bool):
+        return value is None
+    return isinstance(value, float | int) and TRANSMITTANCE_MIN <= value <= 1
 
 
 @dataclass(frozen=True)
