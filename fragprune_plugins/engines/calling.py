@@ -126,6 +126,26 @@ def native_inputs(
     )
 
 
+def new_outputs(inputs: RasterInputs, new: Callable[..., Tensor]) -> dict[str, Tensor]:
+    """Room for what is drawn of any Gaussians by any engine, by the names of fragprune_outputs.
+
+    Args:
+        new: makes a tensor of a shape, float32 unless it is given a ``dtype``.
+    """
+    n, size, whole = len(inputs.splats), (inputs.view.height, inputs.view.width), torch.int32
+    made = {"image": new(3, *size), "radii": new(n, dtype=whole)}
+    made |= {name: new(int(name in inputs.planes), *size) for name in ("invdepth", "alpha")}
+    if inputs.splats.features is not None:
+        made["features"] = new(inputs.splats.features.shape[1], *size)
+    if inputs.counts:
+        made["fragments"] = new(*size, dtype=whole)
+        made["fragments_per_gaussian"] = new(n, dtype=whole)
+    if inputs.scores:
+        made["wins_per_gaussian"] = new(n, dtype=whole)
+        made["winners"] = new(*size, dtype=whole)
+    return made
+
+
 def with_joined_sh(splats: Splats) -> Splats:
     """The same with all coefficients in ``sh``."""
     if splats.sh is None or splats.sh_rest is None:
@@ -160,7 +180,7 @@ _LEARNABLE = tuple(name for name, *_ in binding.InputGrads._fields_[1:])
 def with_gradients(
     inputs: RasterInputs,
     thresholds: Tensor | None,
-    draw: Callable[[Wanted], Mapping[str, Tensor | None]],
+    draw: Callable[[Wanted], Mapping[str, Tensor]],
     undraw: Callable[[Wanted, dict[str, Tensor]], dict[str, Tensor]],
 ) -> dict[str, Any]:
     """Draw in torch's graph.

@@ -132,13 +132,7 @@ class Nvrtc:
         return tuple(results)
 
 
-@cache
-def _opened() -> Nvrtc | str:
-    """The compiler, or the reason why there is none."""
-    try:
-        return Nvrtc()
-    except Unavailable as why:
-        return str(why)
+_opened = cache(Nvrtc)
 
 
 def compiler() -> Nvrtc:
@@ -147,11 +141,9 @@ def compiler() -> Nvrtc:
     Raises:
         Unavailable: there is none, or the environment switches it off; the message says why.
     """
-    off = os.environ.get(ENVIRONMENT, "").strip().lower() in ("off", "0")
-    answer = f"switched off by {ENVIRONMENT}" if off else _opened()
-    if isinstance(answer, str):
-        raise Unavailable(answer)
-    return answer
+    if os.environ.get(ENVIRONMENT, "").strip().lower() in ("off", "0"):
+        raise Unavailable(f"switched off by {ENVIRONMENT}")
+    return _opened()
 
 
 def target_of(capability: int, architectures: tuple[int, ...]) -> str:
