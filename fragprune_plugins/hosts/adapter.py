@@ -52,7 +52,6 @@ class ParamGroup:
         colour: holds the colour, which ``--train appearance`` trains beside the opacity.
         copied: children copy it from their parents bit for bit; this is checked.
         scheduled: the host sets its learning rate in every iteration, also in stage 2.
-        gradient_read: the host reads its gradient in every iteration. While frozen, it gets zeros.
         named: the host's source spells the name out; otherwise the adapter's ``group_name`` does.
     """
 
@@ -60,13 +59,11 @@ class ParamGroup:
     colour: bool = False
     copied: bool = False
     scheduled: bool = False
-    gradient_read: bool = False
     named: bool = True
 
 
-XYZ = ParamGroup("xyz", scheduled=True)
 GROUPS = (
-    XYZ,
+    ParamGroup("xyz", scheduled=True),
     ParamGroup("f_dc", colour=True, copied=True),
     ParamGroup("f_rest", colour=True),
     ParamGroup("opacity"),

@@ -151,17 +151,16 @@ def resumed_at(line: CommandLine, checkpoint: Path) -> int:
 @contextlib.contextmanager
 def resumable(adapter: ScriptAdapter, line: CommandLine, start: Start) -> Iterator[Path]:
     """Yields a file that the host can resume; a checkpoint made from a PLY exists only inside."""
-    if start.path.suffix != ".ply" or line.restarts:
-        adapter.expect_resumable(start.path)
-        yield start.path
-        return
-    made = start.path.with_name(line.made.format(start.iteration))
-    adapter.expect_resumable(made)
-    adapter.checkpoint_from_ply(start.path, start.iteration, made)
+    makes = start.path.suffix == ".ply" and not line.restarts
+    path = start.path.with_name(line.made.format(start.iteration)) if makes else start.path
+    adapter.expect_resumable(path)
+    if makes:
+        adapter.checkpoint_from_ply(start.path, start.iteration, path)
     try:
-        yield made
+        yield path
     finally:
-        made.unlink(missing_ok=True)
+        if makes:
+            path.unlink(missing_ok=True)
 
 
 def holds(start: Path, ply: Path) -> bool:
