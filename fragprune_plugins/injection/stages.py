@@ -72,21 +72,7 @@ class Stages:
     def joint(self) -> None:
         """Run the command once; thresholds learn while the whole model trains."""
         from_iter = self.options.from_iter
-        resumed, start, total = self._learning(
-            self._densified() if from_iter is None else from_iter
-        )
-        log.info("thresholds learn in iterations %d to %d", start + 1, total)
-        steps = total - resumed - self.host.line.skipped
-        settings = replace(self.options.settings, iterations=steps)
-        schedule = JointSchedule(settings, start - resumed + 1)
-        self._learn(
-            total,
-            self.host.saving(self.scratch, total, **self._apart()),
-            freeze=False,
-            start=resumed,
-            schedule=schedule,
-            settings=settings,
-        )
+        self._learn_within(self._densified() if from_iter is None else from_iter, joint=True)
 
     def train_then_finetune(self) -> None:
         """Run stage 1 with a checkpoint at its end, then stage 2 from that checkpoint."""
@@ -154,15 +140,7 @@ class Stages:
         """Run stage 2: resume a model, or begin at ``from_iter`` of one run."""
         settings = self.options.settings
         if self.options.from_iter is not None:
-            resumed, begins, total = self._learning(self.options.from_iter)
-            steps = total - begins - self.host.line.skipped
-            self._learn(
-                total,
-                self.host.saving(self.scratch, total, **self._apart()),
-                from_step=begins - resumed,
-                start=resumed,
-                settings=replace(settings, iterations=steps),
-            )
+            self._learn_within(self.options.from_iter)
             return
         if self.host.line.one_run:
             raise UsageError(
@@ -383,30 +361,36 @@ class Stages:
             )
         return end
 
-    def _learning(self, from_iter: int) -> tuple[int, int, int]:
-        """(resumed, start, last): three iterations of the host.
-
-        The run resumes after iteration ``resumed``, learns after ``start`` and ends with ``last``.
+    def _learn_within(self, from_iter: int, *, joint: bool = False) -> None:
+        """Run the command once, and learn from one of its iterations on, to its end.
 
         Args:
             from_iter: the option, or the end of the host's densification.
+            joint: the whole model trains on; else stage 2 begins there.
         """
         total, file = self.host.iterations, self.host.flags.resume
         if file:
             self.adapter.expect_resumable(Path(file))
         resumed = starting.resumed_at(self.host.line, Path(file)) if file else 0
-        start = max(resumed, from_iter)
-        if start < total - self.host.line.skipped:
-            return resumed, start, total
-        at_end = self.options.from_iter is None and start > resumed
-        where = "densification ends" if at_end else "learning begins"
-        flag = f"Raise {self.host.line.spellings('iterations')[-1]}"
-        raise UsageError(
-            f"--stage {self.options.stage}",
-            f"iterations {resumed + 1} to {total}" if resumed < total else "no iterations",
-            f"iterations after {start}, where {where}",
-            f"{flag}, or lower --from-iter." if start > resumed else f"{flag}.",
-        )
+        start, end = max(resumed, from_iter), total - self.host.line.skipped
+        if start >= end:
+            at_end = self.options.from_iter is None and start > resumed
+            where = "densification ends" if at_end else "learning begins"
+            flag = f"Raise {self.host.line.spellings('iterations')[-1]}"
+            raise UsageError(
+                f"--stage {self.options.stage}",
+                f"iterations {resumed + 1} to {total}" if resumed < total else "no iterations",
+                f"iterations after {start}, where {where}",
+                f"{flag}, or lower --from-iter." if start > resumed else f"{flag}.",
+            )
+        settings = replace(self.options.settings, iterations=end - (resumed if joint else start))
+        options: dict[str, Any] = {"from_step": start - resumed}
+        if joint:
+            log.info("thresholds learn in iterations %d to %d", start + 1, total)
+            schedule = JointSchedule(settings, start - resumed + 1)
+            options = {"freeze": False, "schedule": schedule}
+        arguments = self.host.saving(self.scratch, total, **self._apart())
+        self._learn(total, arguments, start=resumed, settings=settings, **options)
 
     def _model(self, iteration: int) -> Path | None:
         """The host's PLY of an iteration, or None if the host saved none."""
