@@ -75,7 +75,7 @@ def check_tensor(name: str, tensor: Tensor | None, *shape: int | None, whole: bo
         found, expected = f"a {type(tensor).__name__}", "a torch.Tensor"
     elif tensor.is_meta or tensor.layout is not torch.strided:
         found, expected = f"{tensor.layout} on {tensor.device}", "a dense tensor with its numbers"
-    elif not (_is_whole(tensor.dtype) if whole else tensor.dtype.is_floating_point):
+    elif tensor.dtype is torch.bool or tensor.is_complex() or tensor.is_floating_point() is whole:
         found = str(tensor.dtype)
         expected = "integers" if whole else "floating-point numbers"
     elif tensor.ndim != len(shape) or any(
@@ -93,13 +93,6 @@ def require_tensor(name: str, tensor: Tensor, *shape: int | None) -> None:
     if tensor is None:
         raise InputError(name, "None", "a torch.Tensor", "Check the call's arguments.")
     check_tensor(name, tensor, *shape)
-
-
-def _is_whole(dtype: torch.dtype) -> bool:
-    """Whether a dtype is an integer type; torch has no common name for them."""
-    import torch
-
-    return not (dtype.is_floating_point or dtype.is_complex or dtype is torch.bool)
 
 
 def check_lens(
@@ -139,20 +132,12 @@ def check_degree(name: str, sh: Tensor | None, degree: int, sh_rest: Tensor | No
     if sh is None:
         return
     count = sh.shape[1] + (0 if sh_rest is None else sh_rest.shape[1])
-    if count < (degree + 1) ** 2:
-        raise InputError(
-            f"{name}.sh",
-            f"{count} coefficients",
-            f"at least {(degree + 1) ** 2} for degree {degree}",
-            "Lower the SH degree or pass all coefficients.",
-        )
-    if count > COEFFICIENTS_MAX:
-        raise InputError(
-            f"{name}.sh",
-            f"{count} coefficients",
-            f"at most {COEFFICIENTS_MAX}",
-            "Pass (N, coefficients, 3).",
-        )
+    expected, remedy = f"at most {COEFFICIENTS_MAX}", "Pass (N, coefficients, 3)."
+    if count < (least := (degree + 1) ** 2):
+        expected = f"at least {least} for degree {degree}"
+        remedy = "Lower the SH degree or pass all coefficients."
+    if not least <= count <= COEFFICIENTS_MAX:
+        raise InputError(f"{name}.sh", f"{count} coefficients", expected, remedy)
 
 
 @dataclass(frozen=True)
