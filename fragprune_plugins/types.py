@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from fragprune_plugins.constants import (
@@ -95,6 +95,19 @@ def require_tensor(name: str, tensor: Tensor, *shape: int | None) -> None:
     check_tensor(name, tensor, *shape)
 
 
+def check_fields(thing: Any, **shapes: tuple[int | None, ...]) -> None:
+    """Check a dataclass's tensors, as ``check_tensor`` does; those without a default must be there.
+
+    Args:
+        shapes: by a field's name.
+    """
+    for each in fields(thing):
+        if each.name in shapes:
+            check = require_tensor if each.default is MISSING else check_tensor
+            name, value = f"{type(thing).__name__}.{each.name}", getattr(thing, each.name)
+            check(name, value, *shapes[each.name])
+
+
 def check_lens(
     width: int, height: int, fx: float, fy: float, cx: float | None, cy: float | None
 ) -> None:
@@ -172,10 +185,7 @@ class View:
         if self.width < 1 or self.height < 1:
             found = f"{self.width}x{self.height} pixels"
             raise InputError("View", found, "at least 1x1", "Check the camera.")
-        require_tensor("View.viewmatrix", self.viewmatrix, 4, 4)
-        require_tensor("View.projmatrix", self.projmatrix, 4, 4)
-        require_tensor("View.campos", self.campos, 3)
-        require_tensor("View.background", self.background, 3)
+        check_fields(self, viewmatrix=(4, 4), projmatrix=(4, 4), campos=(3,), background=(3,))
 
     def to(self, device: torch.device | str) -> View:
         """The same camera with its tensors on a device."""
@@ -273,15 +283,10 @@ class Splats:
     __repr__ = one_line
 
     def __post_init__(self) -> None:
-        require_tensor("Splats.means", self.means, None, 3)
-        n = len(self.means)
-        require_tensor("Splats.opacities", self.opacities, n)
-        check_tensor("Splats.scales", self.scales, n, 2 if self.flat else 3)
-        check_tensor("Splats.rotations", self.rotations, n, 4)
-        check_tensor("Splats.cov3d", self.cov3d, n, 6)
-        check_tensor("Splats.sh", self.sh, n, None if self.sh_rest is None else 1, 3)
-        check_tensor("Splats.sh_rest", self.sh_rest, n, None, 3)
-        check_tensor("Splats.colors", self.colors, n, 3)
+        check_fields(self, means=(None, 3))
+        n, first = len(self.means), None if self.sh_rest is None else 1
+        check_fields(self, opacities=(n,), scales=(n, 2 if self.flat else 3), rotations=(n, 4))
+        check_fields(self, cov3d=(n, 6), sh=(n, first, 3), sh_rest=(n, None, 3), colors=(n, 3))
         _check_features("Splats.features", self.features, n)
         if (self.scales is None) != (self.rotations is None) or (
             (self.scales is None) == (self.cov3d is None)
@@ -347,12 +352,9 @@ class Footprints:
     __repr__ = one_line
 
     def __post_init__(self) -> None:
-        require_tensor("Footprints.means2d", self.means2d, None, 2)
+        check_fields(self, means2d=(None, 2))
         n = len(self.means2d)
-        require_tensor("Footprints.conics", self.conics, n, 3)
-        require_tensor("Footprints.depths", self.depths, n)
-        require_tensor("Footprints.opacities", self.opacities, n)
-        require_tensor("Footprints.colors", self.colors, n, 3)
+        check_fields(self, conics=(n, 3), depths=(n,), opacities=(n,), colors=(n, 3))
         check_tensor("Footprints.tiles", self.tiles, n, 4, whole=True)
         _check_features("Footprints.features", self.features, n)
 
@@ -435,9 +437,8 @@ class RasterInputs:
     __repr__ = one_line
 
     def __post_init__(self) -> None:
-        check_tensor("RasterInputs.means2d_hook", self.means2d_hook, len(self.splats), None)
         size = self.view.height, self.view.width
-        check_tensor("RasterInputs.sample_offsets", self.sample_offsets, *size, 2)
+        check_fields(self, means2d_hook=(len(self.splats), None), sample_offsets=(*size, 2))
         stop, highest = self.stop, 1 if self.stop is None else STOPPED_ALPHA_MAX
         checks = (
             ("compensation", self.compensation in get_args(Compensation), get_args(Compensation)),
