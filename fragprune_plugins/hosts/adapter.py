@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -71,16 +71,6 @@ GROUPS = (
     ParamGroup("rotation", copied=True),
 )
 """The groups of 3DGS, in order: ``load_state_dict`` matches them by position."""
-
-
-def trained_groups(groups: Iterable[ParamGroup], train: str) -> frozenset[str] | None:
-    """Names of the param groups that stage 2 trains for a value of ``--train``; None for all."""
-    colours = {group.name for group in groups if group.colour}
-    return {
-        "opacity": frozenset({"opacity"}),
-        "appearance": frozenset({"opacity", *colours}),
-        "all": None,
-    }[train]
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from fragprune_plugins.hosts.adapter import (
     optimizer_state,
 )
 from fragprune_plugins.injection.command import HostCommand
-from fragprune_plugins.injection.process import host_checkpoints
+from fragprune_plugins.injection.process import checkpoint_values
 
 log = logging.getLogger("fragprune")
 
@@ -241,7 +241,7 @@ def _read_checkpoint(path: Path) -> tuple[Any, int]:
     """Read (capture, iteration) of a checkpoint; tensors are mapped from the file."""
     if not path.exists():
         raise UsageError(str(path), "no such file", "a checkpoint", "Check the path.")
-    with _DOOR.reading(path), host_checkpoints():
+    with _DOOR.reading(path), torch.serialization.safe_globals(checkpoint_values()):
         # The safe loader: whatever the file holds, nothing of it is run.
         capture, iteration = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
         return capture, int(iteration)

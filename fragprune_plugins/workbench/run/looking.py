@@ -6,9 +6,10 @@ import logging
 from dataclasses import dataclass
 from pathlib import Path
 
+from torch import Tensor
+
 from fragprune_plugins.errors import FragpruneError
 from fragprune_plugins.hosts.photographs import Photographs
-from fragprune_plugins.injection.options import Found
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.workbench.commands.opening import open_engine
 from fragprune_plugins.workbench.commands.options import EngineOptions
@@ -33,15 +34,19 @@ class Looking:
     engine: EngineOptions
     trial: Trial | None = None
 
-    def __call__(self, ply: Path, photographs: Photographs, settings: Settings) -> Found:
+    def __call__(
+        self, ply: Path, photographs: Photographs, settings: Settings
+    ) -> tuple[Settings, Tensor | None]:
         """Make the trial of ``fragprune finetune``, and score the Gaussians as it does."""
         try:
             return self._look(ply, photographs, settings)
         except FragpruneError as error:  # the host may read and draw more than we do
             log.warning("not tried whether it knows its photographs by heart, because of %s", error)
-            return Found(settings)
+            return settings, None
 
-    def _look(self, ply: Path, photographs: Photographs, settings: Settings) -> Found:
+    def _look(
+        self, ply: Path, photographs: Photographs, settings: Settings
+    ) -> tuple[Settings, Tensor | None]:
         engine, device = open_engine(self.engine)
         model, dataset = load(ply, device=device), load_photographs(photographs).to(device)
         trial, kept = tried(model, dataset, settings, engine=engine, say=log.info), None
@@ -49,4 +54,4 @@ class Looking:
             views = views_near(dataset.train, seed=settings.seed)
             kept = best(removal_error(model, model.falloff, views, engine), trial.keep).cpu()
         self.trial = trial
-        return Found(trial.settings, kept)
+        return trial.settings, kept
