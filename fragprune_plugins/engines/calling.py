@@ -120,7 +120,7 @@ def native_inputs(
         flat=isinstance(splats, Splats) and splats.flat,
         soft=inputs.rim == "soft",
         count=len(splats),
-        lengths=native_lengths(arrays),
+        lengths=binding.Lengths(**{name: array.numel() for name, array in arrays.items()}),
         workspace=workspace,
         **{name: address(array) for name, array in arrays.items()},
     )
@@ -151,11 +151,6 @@ def with_joined_sh(splats: Splats) -> Splats:
     if splats.sh is None or splats.sh_rest is None:
         return splats
     return replace(splats, sh=torch.cat([splats.sh, splats.sh_rest], dim=1), sh_rest=None)
-
-
-def native_lengths(arrays: dict[str, Tensor]) -> binding.Lengths:
-    """Fill the struct fragprune_lengths for arrays given by name."""
-    return binding.Lengths(**{name: array.numel() for name, array in arrays.items()})
 
 
 def native_threads() -> int:

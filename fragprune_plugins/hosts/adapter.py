@@ -296,7 +296,7 @@ class HostAdapter(ABC):
     def match(self, repo: HostRepo) -> Match:
         """Check fingerprint and seams. An adapter that raises does not fit."""
         try:
-            seams = look_up(repo, self.seams_for(repo))
+            seams = [look_up(repo, seam) for seam in self.seams_for(repo)]
             findings = [*self.fingerprint(repo), *(each.finding for each in seams if each.finding)]
         except Exception as error:  # the adapter's own; others are still tried
             failed = Finding.error(

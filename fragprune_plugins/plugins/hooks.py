@@ -6,6 +6,7 @@ Every command, the session of a host and the functions of the package ask here a
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -88,10 +89,7 @@ def thresholds_for(
         return given
     if given.neutral:
         return None
-
-    def wrong(answer: Any) -> Wrong | None:
-        return _no_thresholds(answer, len(given), inputs.splats.device)
-
+    wrong = partial(_no_thresholds, count=len(given), device=inputs.splats.device)
     hook = hookspecs.fragprune_truncate
     answer = (plugins or installed()).ask(hook, wrong, inputs=inputs, store=given)
     return given.values if answer is None else answer
