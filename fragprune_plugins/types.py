@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from fragprune_plugins.constants import (
@@ -75,7 +75,7 @@ def check_tensor(name: str, tensor: Tensor | None, *shape: int | None, whole: bo
         found, expected = f"a {type(tensor).__name__}", "a torch.Tensor"
     elif tensor.is_meta or tensor.layout is not torch.strided:
         found, expected = f"{tensor.layout} on {tensor.device}", "a dense tensor with its numbers"
-    elif not (_is_whole(tensor.dtype) if whole else tensor.dtype.is_floating_point):
+    elif tensor.dtype is torch.bool or tensor.is_complex() or tensor.is_floating_point() is whole:
         found = str(tensor.dtype)
         expected = "integers" if whole else "floating-point numbers"
     elif tensor.ndim != len(shape) or any(
@@ -95,11 +95,17 @@ def require_tensor(name: str, tensor: Tensor, *shape: int | None) -> None:
     check_tensor(name, tensor, *shape)
 
 
-def _is_whole(dtype: torch.dtype) -> bool:
-    """Whether a dtype is an integer type; torch has no common name for them."""
-    import torch
+def check_fields(thing: Any, **shapes: tuple[int | None, ...]) -> None:
+    """Check a dataclass's tensors, as ``check_tensor`` does; those without a default must be there.
 
-    return not (dtype.is_floating_point or dtype.is_complex or dtype is torch.bool)
+    Args:
+        shapes: by a field's name.
+    """
+    for each in fields(thing):
+        if each.name in shapes:
+            check = require_tensor if each.default is MISSING else check_tensor
+            name, value = f"{type(thing).__name__}.{each.name}", getattr(thing, each.name)
+            check(name, value, *shapes[each.name])
 
 
 def check_lens(
@@ -139,20 +145,12 @@ def check_degree(name: str, sh: Tensor | None, degree: int, sh_rest: Tensor | No
     if sh is None:
         return
     count = sh.shape[1] + (0 if sh_rest is None else sh_rest.shape[1])
-    if count < (degree + 1) ** 2:
-        raise InputError(
-            f"{name}.sh",
-            f"{count} coefficients",
-            f"at least {(degree + 1) ** 2} for degree {degree}",
-            "Lower the SH degree or pass all coefficients.",
-        )
-    if count > COEFFICIENTS_MAX:
-        raise InputError(
-            f"{name}.sh",
-            f"{count} coefficients",
-            f"at most {COEFFICIENTS_MAX}",
-            "Pass (N, coefficients, 3).",
-        )
+    expected, remedy = f"at most {COEFFICIENTS_MAX}", "Pass (N, coefficients, 3)."
+    if count < (least := (degree + 1) ** 2):
+        expected = f"at least {least} for degree {degree}"
+        remedy = "Lower the SH degree or pass all coefficients."
+    if not least <= count <= COEFFICIENTS_MAX:
+        raise InputError(f"{name}.sh", f"{count} coefficients", expected, remedy)
 
 
 @dataclass(frozen=True)
@@ -187,10 +185,7 @@ class View:
         if self.width < 1 or self.height < 1:
             found = f"{self.width}x{self.height} pixels"
             raise InputError("View", found, "at least 1x1", "Check the camera.")
-        require_tensor("View.viewmatrix", self.viewmatrix, 4, 4)
-        require_tensor("View.projmatrix", self.projmatrix, 4, 4)
-        require_tensor("View.campos", self.campos, 3)
-        require_tensor("View.background", self.background, 3)
+        check_fields(self, viewmatrix=(4, 4), projmatrix=(4, 4), campos=(3,), background=(3,))
 
     def to(self, device: torch.device | str) -> View:
         """The same camera with its tensors on a device."""
@@ -288,15 +283,10 @@ class Splats:
     __repr__ = one_line
 
     def __post_init__(self) -> None:
-        require_tensor("Splats.means", self.means, None, 3)
-        n = len(self.means)
-        require_tensor("Splats.opacities", self.opacities, n)
-        check_tensor("Splats.scales", self.scales, n, 2 if self.flat else 3)
-        check_tensor("Splats.rotations", self.rotations, n, 4)
-        check_tensor("Splats.cov3d", self.cov3d, n, 6)
-        check_tensor("Splats.sh", self.sh, n, None if self.sh_rest is None else 1, 3)
-        check_tensor("Splats.sh_rest", self.sh_rest, n, None, 3)
-        check_tensor("Splats.colors", self.colors, n, 3)
+        check_fields(self, means=(None, 3))
+        n, first = len(self.means), None if self.sh_rest is None else 1
+        check_fields(self, opacities=(n,), scales=(n, 2 if self.flat else 3), rotations=(n, 4))
+        check_fields(self, cov3d=(n, 6), sh=(n, first, 3), sh_rest=(n, None, 3), colors=(n, 3))
         _check_features("Splats.features", self.features, n)
         if (self.scales is None) != (self.rotations is None) or (
             (self.scales is None) == (self.cov3d is None)
@@ -362,12 +352,9 @@ class Footprints:
     __repr__ = one_line
 
     def __post_init__(self) -> None:
-        require_tensor("Footprints.means2d", self.means2d, None, 2)
+        check_fields(self, means2d=(None, 2))
         n = len(self.means2d)
-        require_tensor("Footprints.conics", self.conics, n, 3)
-        require_tensor("Footprints.depths", self.depths, n)
-        require_tensor("Footprints.opacities", self.opacities, n)
-        require_tensor("Footprints.colors", self.colors, n, 3)
+        check_fields(self, conics=(n, 3), depths=(n,), opacities=(n,), colors=(n, 3))
         check_tensor("Footprints.tiles", self.tiles, n, 4, whole=True)
         _check_features("Footprints.features", self.features, n)
 
@@ -387,7 +374,9 @@ def is_rim(value: object) -> bool:
 
 def is_stop(value: object) -> bool:
     """Whether a value can be the ``stop`` of ``RasterInputs``."""
-    return value is None or (isinstance(value, float | int) and TRANSMITTANCE_MIN <= value <= 1)
+    if value is None or isinstance(value, bool):
+        return value is None
+    return isinstance(value, float | int) and TRANSMITTANCE_MIN <= value <= 1
 
 
 @dataclass(frozen=True)
@@ -448,9 +437,8 @@ class RasterInputs:
     __repr__ = one_line
 
     def __post_init__(self) -> None:
-        check_tensor("RasterInputs.means2d_hook", self.means2d_hook, len(self.splats), None)
         size = self.view.height, self.view.width
-        check_tensor("RasterInputs.sample_offsets", self.sample_offsets, *size, 2)
+        check_fields(self, means2d_hook=(len(self.splats), None), sample_offsets=(*size, 2))
         stop, highest = self.stop, 1 if self.stop is None else STOPPED_ALPHA_MAX
         checks = (
             ("compensation", self.compensation in get_args(Compensation), get_args(Compensation)),

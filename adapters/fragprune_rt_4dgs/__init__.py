@@ -33,6 +33,14 @@ def with_its_map(call: SeamCall) -> Any:
     return call.first
 
 
+def with_a_gradient_of_times(call: SeamCall) -> Any:
+    """Give the moments a gradient, which the host reads in every iteration, also while frozen."""
+    moments = call.model._t
+    if moments.grad is None:
+        moments.grad = moments.new_zeros(moments.shape)
+    return call.result
+
+
 class RT4DGS(GraphdecoAdapter):
     """The adapter of RT-4DGS, with and without 4D rotation."""
 
@@ -51,7 +59,7 @@ class RT4DGS(GraphdecoAdapter):
     calls = (RasterizerCall(SETTINGS, OUTPUTS, arguments=ARGUMENTS),)
     groups = (
         *GraphdecoAdapter.groups,
-        ParamGroup("t", gradient_read=True),
+        ParamGroup("t"),
         ParamGroup("scaling_t"),
         ParamGroup("rotation_r"),
     )
@@ -76,6 +84,7 @@ class RT4DGS(GraphdecoAdapter):
         GraphdecoAdapter.seams,
         {
             "GaussianRasterizer.forward": {"module": RASTERIZER},
+            "GaussianModel.update_learning_rate": {"how": with_a_gradient_of_times},
             "GaussianModel.restore": {"how": with_its_map},
             "GaussianModel.save_ply": None,
             "GaussianModel.load_ply": None,

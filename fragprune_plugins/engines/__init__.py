@@ -86,29 +86,25 @@ def create_engine(name: str, device: torch.device | str = "cpu") -> Engine:
     Raises:
         EngineError: the name is unknown, or the engine cannot run here.
     """
-    if name == "auto":
-        name = _fastest(str(device))
-    if name not in ENGINES:
-        raise EngineError("engine", repr(name), f"one of auto, {', '.join(ENGINES)}", "Choose one.")
-    module, _, kind = ENGINES[name].partition(":")
-    engine: Engine = getattr(import_module(f"{__name__}.{module}"), kind)()
-    return engine
-
-
-def _fastest(device: str) -> str:
-    """The fastest engine's name; raises EngineError on a GPU that the cuda engine cannot use."""
-    if device.startswith("cuda"):
-        if (why_not := _why_not_cuda(device)) is not None:
+    if name == "auto" and str(device).startswith("cuda"):
+        if (why_not := _why_not_cuda(str(device))) is not None:
             raise EngineError(
                 "engine 'auto'",
                 why_not[0],
                 "an engine that draws on a GPU in a reasonable time",
                 f"{why_not[1]} Or draw on the CPU: --device cpu. --engine reference is slow.",
             )
-        return "cuda"
-    from fragprune_plugins.engines.cpu import binding
+        name = "cuda"
+    elif name == "auto":
+        from fragprune_plugins.engines.cpu import binding
 
-    return "cpu" if device.startswith("cpu") and binding.available() else "reference"
+        native = str(device).startswith("cpu") and binding.available()
+        name = "cpu" if native else "reference"
+    if name not in ENGINES:
+        raise EngineError("engine", repr(name), f"one of auto, {', '.join(ENGINES)}", "Choose one.")
+    module, _, kind = ENGINES[name].partition(":")
+    engine: Engine = getattr(import_module(f"{__name__}.{module}"), kind)()
+    return engine
 
 
 def _why_not_cuda(device: str) -> tuple[str, str] | None:

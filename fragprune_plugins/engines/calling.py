@@ -120,10 +120,30 @@ def native_inputs(
         flat=isinstance(splats, Splats) and splats.flat,
         soft=inputs.rim == "soft",
         count=len(splats),
-        lengths=native_lengths(arrays),
+        lengths=binding.Lengths(**{name: array.numel() for name, array in arrays.items()}),
         workspace=workspace,
         **{name: address(array) for name, array in arrays.items()},
     )
+
+
+def new_outputs(inputs: RasterInputs, new: Callable[..., Tensor]) -> dict[str, Tensor]:
+    """Room for what is drawn of any Gaussians by any engine, by the names of fragprune_outputs.
+
+    Args:
+        new: makes a tensor of a shape, float32 unless it is given a ``dtype``.
+    """
+    n, size, whole = len(inputs.splats), (inputs.view.height, inputs.view.width), torch.int32
+    made = {"image": new(3, *size), "radii": new(n, dtype=whole)}
+    made |= {name: new(int(name in inputs.planes), *size) for name in ("invdepth", "alpha")}
+    if inputs.splats.features is not None:
+        made["features"] = new(inputs.splats.features.shape[1], *size)
+    if inputs.counts:
+        made["fragments"] = new(*size, dtype=whole)
+        made["fragments_per_gaussian"] = new(n, dtype=whole)
+    if inputs.scores:
+        made["wins_per_gaussian"] = new(n, dtype=whole)
+        made["winners"] = new(*size, dtype=whole)
+    return made
 
 
 def with_joined_sh(splats: Splats) -> Splats:
@@ -131,11 +151,6 @@ def with_joined_sh(splats: Splats) -> Splats:
     if splats.sh is None or splats.sh_rest is None:
         return splats
     return replace(splats, sh=torch.cat([splats.sh, splats.sh_rest], dim=1), sh_rest=None)
-
-
-def native_lengths(arrays: dict[str, Tensor]) -> binding.Lengths:
-    """Fill the struct fragprune_lengths for arrays given by name."""
-    return binding.Lengths(**{name: array.numel() for name, array in arrays.items()})
 
 
 def native_threads() -> int:
@@ -160,7 +175,7 @@ _LEARNABLE = tuple(name for name, *_ in binding.InputGrads._fields_[1:])
 def with_gradients(
     inputs: RasterInputs,
     thresholds: Tensor | None,
-    draw: Callable[[Wanted], Mapping[str, Tensor | None]],
+    draw: Callable[[Wanted], Mapping[str, Tensor]],
     undraw: Callable[[Wanted, dict[str, Tensor]], dict[str, Tensor]],
 ) -> dict[str, Any]:
     """Draw in torch's graph.

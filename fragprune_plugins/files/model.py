@@ -10,7 +10,7 @@ from torch import Tensor
 
 from fragprune_plugins.errors import AlignmentError, InputError
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.types import Rim, Splats, check_tensor, one_line
+from fragprune_plugins.types import Rim, Splats, check_fields, one_line
 
 REST_COUNTS = {3 * (degree + 1) ** 2 - 3: degree for degree in range(4)}
 """The SH degree by the number of values in a row of ``f_rest``."""
@@ -49,16 +49,8 @@ class Model:
 
     def __post_init__(self) -> None:
         n, axes = len(self.xyz), 2 if tuple(self.scaling.shape[1:]) == (2,) else 3
-        for name, *shape in (
-            ("xyz", n, 3),
-            ("f_dc", n, 1, 3),
-            ("f_rest", n, None, 3),
-            ("opacity", n, 1),
-            ("scaling", n, axes),
-            ("rotation", n, 4),
-            ("filter_3d", n, 1),
-        ):
-            check_tensor(f"Model.{name}", getattr(self, name), *shape)
+        check_fields(self, xyz=(n, 3), f_dc=(n, 1, 3), f_rest=(n, None, 3), opacity=(n, 1))
+        check_fields(self, scaling=(n, axes), rotation=(n, 4), filter_3d=(n, 1))
         if 3 * self.f_rest.shape[1] not in REST_COUNTS:
             raise InputError(
                 "Model.f_rest",

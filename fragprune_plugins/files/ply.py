@@ -58,6 +58,7 @@ focal length and squares it, and float32 ends at 1e38."""
 _QUATERNION_MIN = 1e-12  # torch's normalize divides by no less
 
 log = logging.getLogger("fragprune")
+_warn = cache(log.warning)  # once, because commands read a file several times
 
 _SHOWN_COLUMNS = 12
 _BLOCK = 4096  # rows that are read column by column, so that they stay in the cache
@@ -193,12 +194,6 @@ def _expect_no_other(path: Path, others: list[str]) -> None:
         shown = ", ".join(others[:_SHOWN_COLUMNS])
         more = f" and {len(others) - _SHOWN_COLUMNS} more" if len(others) > _SHOWN_COLUMNS else ""
         _warn(f"{path}: ignored its columns {shown}{more}")
-
-
-@cache
-def _warn(message: str) -> None:
-    """Say something once: commands read a file several times."""
-    log.warning(message)
 
 
 def read_thresholds(path: Path) -> ThresholdStore | None:

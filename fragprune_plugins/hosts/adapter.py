@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -52,7 +52,6 @@ class ParamGroup:
         colour: holds the colour, which ``--train appearance`` trains beside the opacity.
         copied: children copy it from their parents bit for bit; this is checked.
         scheduled: the host sets its learning rate in every iteration, also in stage 2.
-        gradient_read: the host reads its gradient in every iteration. While frozen, it gets zeros.
         named: the host's source spells the name out; otherwise the adapter's ``group_name`` does.
     """
 
@@ -60,13 +59,11 @@ class ParamGroup:
     colour: bool = False
     copied: bool = False
     scheduled: bool = False
-    gradient_read: bool = False
     named: bool = True
 
 
-XYZ = ParamGroup("xyz", scheduled=True)
 GROUPS = (
-    XYZ,
+    ParamGroup("xyz", scheduled=True),
     ParamGroup("f_dc", colour=True, copied=True),
     ParamGroup("f_rest", colour=True),
     ParamGroup("opacity"),
@@ -74,16 +71,6 @@ GROUPS = (
     ParamGroup("rotation", copied=True),
 )
 """The groups of 3DGS, in order: ``load_state_dict`` matches them by position."""
-
-
-def trained_groups(groups: Iterable[ParamGroup], train: str) -> frozenset[str] | None:
-    """Names of the param groups that stage 2 trains for a value of ``--train``; None for all."""
-    colours = {group.name for group in groups if group.colour}
-    return {
-        "opacity": frozenset({"opacity"}),
-        "appearance": frozenset({"opacity", *colours}),
-        "all": None,
-    }[train]
 
 
 @dataclass(frozen=True)
@@ -309,7 +296,7 @@ class HostAdapter(ABC):
     def match(self, repo: HostRepo) -> Match:
         """Check fingerprint and seams. An adapter that raises does not fit."""
         try:
-            seams = look_up(repo, self.seams_for(repo))
+            seams = [look_up(repo, seam) for seam in self.seams_for(repo)]
             findings = [*self.fingerprint(repo), *(each.finding for each in seams if each.finding)]
         except Exception as error:  # the adapter's own; others are still tried
             failed = Finding.error(

@@ -247,12 +247,8 @@ class HostRepo:
         return next((each for each in found if _COMMIT.fullmatch(each)), "")
 
 
-def look_up(repo: HostRepo, seams: Iterable[Seam]) -> list[SeamState]:
-    """Look up each seam in the source, in order, without an import."""
-    return [_look_up(repo, seam) for seam in seams]
-
-
-def _look_up(repo: HostRepo, seam: Seam) -> SeamState:
+def look_up(repo: HostRepo, seam: Seam) -> SeamState:
+    """Look up a seam in the source, without an import."""
     if seam.external:
         return SeamState(seam, "at import")
     at = repo.place(seam.module, seam.attribute)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from fragprune_plugins.errors import AlignmentError
 from fragprune_plugins.hosts.seams import SeamCall
@@ -42,7 +40,11 @@ def on_append(session: SessionState, call: SeamCall) -> Any:
     if parents is not None:
         parents, rest = parents[:count], parents[count:]
         state.pending_parents = rest if len(rest) else None  # parents of the next append
-        copies = len(parents) == count and are_copies(session, call.model, tensors, parents)
+        known = {name: group["params"][0] for name, group in session.groups(call.model)}
+        copied = [group.name for group in session.adapter.groups if group.copied]
+        copies = len(parents) == count and all(
+            torch.equal(tensors[name], known[name][parents]) for name in copied
+        )
         what = f"{count} new rows that are not copies of the selected parents"
         expect_children(call, what, copies)
     result = call.run()
@@ -61,20 +63,6 @@ def expect_children(call: SeamCall, found: str, right: bool) -> None:
             "one child per selected parent and repeat, in the host's order",
             "Report this with the host's commit: its densification differs.",
         )
-
-
-def are_copies(
-    session: SessionState, model: Any, tensors: Mapping[str, Tensor], parents: Tensor
-) -> bool:
-    """Whether new rows equal their parents to the bit in every group that children copy.
-
-    Args:
-        tensors: (P, ...) new rows by param group.
-        parents: (P,) rows of the parents.
-    """
-    known = {name: group["params"][0] for name, group in session.groups(model)}
-    copied = [group.name for group in session.adapter.groups if group.copied]
-    return all(torch.equal(tensors[name], known[name][parents]) for name in copied)
 
 
 def on_keep(session: SessionState, call: SeamCall) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import logging
 import re
 from dataclasses import dataclass
@@ -20,39 +19,33 @@ _OPTION = re.compile("-[bBdEiIOPqsSuvx]+|-[WX].*")
 log = logging.getLogger("fragprune")
 
 
-@dataclass(frozen=True)
+@dataclass
 class HostCommand:
     """The parts of a host's command. The host itself parses all of its flags.
 
     Attributes:
         arguments: the script's arguments, unchanged.
-        flags: values of the flags that fragprune reads, by field of ``CommandLine``.
-        line: the host's spellings of these flags.
+        line: the host's spellings of the flags that fragprune reads.
         module: the module's name in ``python -m module``; "" for a script.
+        flags: values of these flags, by field of ``CommandLine``.
+
+    Raises:
+        UsageError: a flag lacks its value, or the configuration file cannot be read.
     """
 
     script: Path
     arguments: list[str]
-    flags: argparse.Namespace
     line: CommandLine
     module: str = ""
 
-    @classmethod
-    def read(
-        cls, script: Path, arguments: list[str], line: CommandLine, module: str = ""
-    ) -> HostCommand:
-        """Build from a script and its arguments; reads the flags of ``line``.
-
-        Raises:
-            UsageError: a flag lacks its value, or the configuration file cannot be read.
-        """
-        return cls(script, arguments, line.read(arguments), line, module)
+    def __post_init__(self) -> None:
+        self.flags = self.line.read(self.arguments)
 
     def of(self, script: Path, arguments: list[str]) -> HostCommand:
         """A command for another script of the same folder; it runs as a module if this one does."""
         package = self.module.split(".")[:-1]
         module = ".".join([*package, script.stem]) if self.module else ""
-        return self.read(script, arguments, self.line, module)
+        return HostCommand(script, arguments, self.line, module)
 
     @property
     def output(self) -> Path | None:

@@ -61,7 +61,7 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
     if not isinstance(trainer, ScriptAdapter):
         summary: RunSummary = trainer(script, arguments, module, options)
         return summary
-    host = HostCommand.read(script, arguments, trainer.command_line(repo), module)
+    host = HostCommand(script, arguments, trainer.command_line(repo), module)
     device = process.host_device(options.device, options.engine)
     _expect_engine(trainer, options, device, plugins)
     started = time.perf_counter()

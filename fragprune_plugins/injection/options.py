@@ -13,27 +13,15 @@ from fragprune_plugins.errors import NotComparedError
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.learning.events import Summary
 from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.types import one_line
 
 Stage = Literal["auto", "finetune", "joint", "off"]
 
 
-@dataclass(frozen=True)
-class Found:
-    """What a look at the model of stage 1 found that stage 2 should do.
+Look = Callable[[Path, Photographs, Settings], tuple[Settings, Tensor | None]]
+"""Is given the PLY of stage 1, its photographs, and the settings that were asked for.
 
-    Attributes:
-        settings: to learn with.
-        kept: (N,) bool, the Gaussians that stage 2 begins with; None for all.
-    """
-
-    settings: Settings
-    kept: Tensor | None = None
-    __repr__ = one_line
-
-
-Look = Callable[[Path, Photographs, Settings], Found]
-"""Is given the PLY of stage 1, its photographs, and the settings that were asked for."""
+It gives those to learn with, and (N,) bool, the Gaussians that stage 2 begins with; None for all.
+"""
 
 
 @dataclass(frozen=True)

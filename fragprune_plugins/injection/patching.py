@@ -10,7 +10,6 @@ from __future__ import annotations
 import inspect
 import sys
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -76,7 +75,7 @@ class PatchLedger:
         # wrapt keeps a hook whose module is never imported: undo() empties it.
         waiting: list[Callable[[ModuleType], None]] = [apply]
         self._waiting.append(waiting)
-        wrapt.register_post_import_hook(partial(_call_all, waiting), seam.module)
+        wrapt.register_post_import_hook(lambda found: [do(found) for do in waiting], seam.module)
 
     def undo(self) -> list[Finding]:
         """Restore every original, newest first.
@@ -156,11 +155,6 @@ class PatchLedger:
                 "activation before the host's imports",
                 "Start the host with fragprune run, or call activate() above those imports.",
             )
-
-
-def _call_all(functions: list[Callable[[ModuleType], None]], module: ModuleType) -> None:
-    for function in functions:
-        function(module)
 
 
 def _rebind(name: str, ours: Any, module: ModuleType) -> None:

@@ -9,7 +9,6 @@ import runpy
 import sys
 import traceback
 from collections.abc import Iterator
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NoReturn
 from unittest import mock
@@ -82,7 +81,7 @@ def host_process(
 def surroundings(device: str) -> Iterator[None]:
     """Inside, torch and Pillow do what hosts expect of them on this device."""
     with (
-        host_checkpoints(),
+        torch.serialization.safe_globals(checkpoint_values()),
         _host_pictures(),
         mock.patch.object(os, "execv", _refuse_to_start_again),
         cpu_only() if device == "cpu" else current_gpu(device),
@@ -163,12 +162,6 @@ def current_gpu(device: str) -> Iterator[None]:
         return
     with torch.cuda.device(device), mock.patch.object(torch.cuda, "set_device"):
         yield
-
-
-def host_checkpoints() -> AbstractContextManager[None]:
-    """Inside, torch's safe loader reads hosts' checkpoints."""
-    context: AbstractContextManager[None] = torch.serialization.safe_globals(checkpoint_values())
-    return context
 
 
 def checkpoint_values() -> list[Any]:

@@ -16,6 +16,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
 from fragprune_plugins.errors import (
     HostFailed,
     Interrupted,
@@ -31,7 +33,7 @@ from fragprune_plugins.hosts.seams import Seam
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import process, starting, workers
 from fragprune_plugins.injection.command import HostCommand
-from fragprune_plugins.injection.options import Found, RunOptions, RunSummary
+from fragprune_plugins.injection.options import RunOptions, RunSummary
 from fragprune_plugins.injection.session import Session
 from fragprune_plugins.injection.starting import Start
 from fragprune_plugins.learning.events import Summary
@@ -63,7 +65,7 @@ class Stages:
     already_finished: bool = False
 
     def __post_init__(self) -> None:
-        self.output, self.found = self.host.output, Found(self.options.settings)
+        self.output, self.settings = self.host.output, self.options.settings  # those of stage 2
 
     def observe(self) -> None:
         """Run the command unchanged; thresholds of sidecars apply, and nothing learns."""
@@ -71,22 +73,17 @@ class Stages:
 
     def joint(self) -> None:
         """Run the command once; thresholds learn while the whole model trains."""
-        from_iter = self.options.from_iter
-        resumed, start, total = self._learning(
-            self._densified() if from_iter is None else from_iter
-        )
-        log.info("thresholds learn in iterations %d to %d", start + 1, total)
-        steps = total - resumed - self.host.line.skipped
-        settings = replace(self.options.settings, iterations=steps)
-        schedule = JointSchedule(settings, start - resumed + 1)
-        self._learn(
-            total,
-            self.host.saving(self.scratch, total, **self._apart()),
-            freeze=False,
-            start=resumed,
-            schedule=schedule,
-            settings=settings,
-        )
+        host, from_iter = self.host, self.options.from_iter
+        if from_iter is None:
+            from_iter = self.adapter.densified(self.repo, host.script, host.arguments)
+        if from_iter is None:
+            raise UsageError(
+                "--stage joint",
+                f"{self.adapter.info.title}, which does not tell when its densification is over",
+                "the iteration after which thresholds learn",
+                "Add --from-iter.",
+            )
+        self._learn_within(from_iter, joint=True)
 
     def train_then_finetune(self) -> None:
         """Run stage 1 with a checkpoint at its end, then stage 2 from that checkpoint."""
@@ -154,15 +151,7 @@ class Stages:
         """Run stage 2: resume a model, or begin at ``from_iter`` of one run."""
         settings = self.options.settings
         if self.options.from_iter is not None:
-            resumed, begins, total = self._learning(self.options.from_iter)
-            steps = total - begins - self.host.line.skipped
-            self._learn(
-                total,
-                self.host.saving(self.scratch, total, **self._apart()),
-                from_step=begins - resumed,
-                start=resumed,
-                settings=replace(settings, iterations=steps),
-            )
+            self._learn_within(self.options.from_iter)
             return
         if self.host.line.one_run:
             raise UsageError(
@@ -184,14 +173,13 @@ class Stages:
             extra |= self._apart("finetuned" if line.restarts else "")
             known = None if self.options.again else self._finished(start, self._model(total))
             if known is not None:
-                self.found, self.after, self.already_finished = known, self._model(total), True
+                self.settings, self.after, self.already_finished = known, self._model(total), True
                 return
-            self.found = self._look(checkpoint)
-            if self.found.kept is not None:
-                part = starting.part_of(checkpoint, self.found.kept, self.scratch)
-                extra["resume"] = str(part)
+            self.settings, kept = self._look(checkpoint)
+            if kept is not None:
+                extra["resume"] = str(starting.part_of(checkpoint, kept, self.scratch))
             arguments = self.host.saving(self.scratch, total, **extra)
-            self._learn(total, arguments, start=first, settings=self.found.settings)
+            self._learn(total, arguments, start=first, settings=self.settings)
 
     def _apart(self, own: str = "") -> dict[str, str]:
         """Save what learns in a folder of its own in the output folder, where it needs one.
@@ -220,15 +208,15 @@ class Stages:
             raise HostFailed(error.where, error.found, error.expected, remedy) from error
         self.after = self._model(last)
 
-    def _look(self, checkpoint: Path) -> Found:
-        """What stage 2 does after a look at the model of stage 1; what was asked for without one.
+    def _look(self, checkpoint: Path) -> tuple[Settings, Tensor | None]:
+        """What a look at the model of stage 1 gives; what was asked for without one.
 
         Other rules of drawing than vanilla's are not known to whoever looks.
 
         Args:
             checkpoint: that the host resumes.
         """
-        asked, look = Found(self.options.settings), self.options.look
+        asked, look = (self.options.settings, None), self.options.look
         if look is None or self.before is None:
             return asked
         try:
@@ -246,7 +234,7 @@ class Stages:
                 self.before,
             )
             return asked
-        return look(self.before, photographs, asked.settings)
+        return look(self.before, photographs, self.options.settings)
 
     def _execute(
         self,
@@ -295,7 +283,7 @@ class Stages:
                 self.learned = session.finish()
                 self.curves = session.curves
 
-    def _finished(self, start: Start, result: Path | None) -> Found | None:
+    def _finished(self, start: Start, result: Path | None) -> Settings | None:
         """With what stage 2 wrote this file from this start, if that is what is asked for."""
         if result is None or start.path.stat().st_mtime_ns > result.stat().st_mtime_ns:
             return None
@@ -308,7 +296,7 @@ class Stages:
             settings = replace(settings, dropout=info.settings.get("dropout"))
         asked = settings.as_dict(), self.adapter.name, self.repo.commit
         written = info.settings, info.adapter, info.host_commit
-        return Found(settings) if written == asked else None
+        return settings if written == asked else None
 
     def _interrupted(self, error: KeyboardInterrupt, saved: Path | None) -> Interrupted:
         """The error that reports Ctrl-C or SIGTERM, names the saved model, and says how to go on.
@@ -334,7 +322,7 @@ class Stages:
 
     def summary(self, seconds: float) -> RunSummary:
         """The summary, after all stages have ended."""
-        settings: dict[str, Any] = {"settings": self.found.settings.as_dict()}
+        settings: dict[str, Any] = {"settings": self.settings.as_dict()}
         learned = vars(self.learned) if self.learned else {"adapter": self.adapter.name}
         photographs, drawing, not_compared = self._comparison()
         return RunSummary(
@@ -370,43 +358,36 @@ class Stages:
         except NotComparedError as error:
             return None, {}, error
 
-    def _densified(self) -> int:
-        """The iteration after which the host's densification is over."""
-        host = self.host
-        end = self.adapter.densified(self.repo, host.script, host.arguments)
-        if end is None:
-            raise UsageError(
-                "--stage joint",
-                f"{self.adapter.info.title}, which does not tell when its densification is over",
-                "the iteration after which thresholds learn",
-                "Add --from-iter.",
-            )
-        return end
-
-    def _learning(self, from_iter: int) -> tuple[int, int, int]:
-        """(resumed, start, last): three iterations of the host.
-
-        The run resumes after iteration ``resumed``, learns after ``start`` and ends with ``last``.
+    def _learn_within(self, from_iter: int, *, joint: bool = False) -> None:
+        """Run the command once, and learn from one of its iterations on, to its end.
 
         Args:
             from_iter: the option, or the end of the host's densification.
+            joint: the whole model trains on; else stage 2 begins there.
         """
         total, file = self.host.iterations, self.host.flags.resume
         if file:
             self.adapter.expect_resumable(Path(file))
         resumed = starting.resumed_at(self.host.line, Path(file)) if file else 0
-        start = max(resumed, from_iter)
-        if start < total - self.host.line.skipped:
-            return resumed, start, total
-        at_end = self.options.from_iter is None and start > resumed
-        where = "densification ends" if at_end else "learning begins"
-        flag = f"Raise {self.host.line.spellings('iterations')[-1]}"
-        raise UsageError(
-            f"--stage {self.options.stage}",
-            f"iterations {resumed + 1} to {total}" if resumed < total else "no iterations",
-            f"iterations after {start}, where {where}",
-            f"{flag}, or lower --from-iter." if start > resumed else f"{flag}.",
-        )
+        start, end = max(resumed, from_iter), total - self.host.line.skipped
+        if start >= end:
+            at_end = self.options.from_iter is None and start > resumed
+            where = "densification ends" if at_end else "learning begins"
+            flag = f"Raise {self.host.line.spellings('iterations')[-1]}"
+            raise UsageError(
+                f"--stage {self.options.stage}",
+                f"iterations {resumed + 1} to {total}" if resumed < total else "no iterations",
+                f"iterations after {start}, where {where}",
+                f"{flag}, or lower --from-iter." if start > resumed else f"{flag}.",
+            )
+        settings = replace(self.options.settings, iterations=end - (resumed if joint else start))
+        options: dict[str, Any] = {"from_step": start - resumed}
+        if joint:
+            log.info("thresholds learn in iterations %d to %d", start + 1, total)
+            schedule = JointSchedule(settings, start - resumed + 1)
+            options = {"freeze": False, "schedule": schedule}
+        arguments = self.host.saving(self.scratch, total, **self._apart())
+        self._learn(total, arguments, start=resumed, settings=settings, **options)
 
     def _model(self, iteration: int) -> Path | None:
         """The host's PLY of an iteration, or None if the host saved none."""

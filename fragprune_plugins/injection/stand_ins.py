@@ -24,15 +24,14 @@ def runs_here(dialect: Dialect, package: str) -> bool:
     """Whether the host can import and run its own compiled modules of a package here."""
     names = dialect.names()
     own = package not in names and any(name.startswith(f"{package}.") for name in names)
-    if own and dialect.own_kernels:  # the host's folder need not be on the path yet
-        return torch.cuda.is_available() and (dialect.own_kernels != "compiler" or _compiles())
-    return present(package)
+    if not (own and dialect.own_kernels):
+        return present(package)
+    # Nothing is imported: the host's folder need not be on the path yet.
+    if dialect.own_kernels == "compiler" and torch.cuda.is_available():
+        from torch.utils.cpp_extension import CUDA_HOME  # brings setuptools, which alters sys.path
 
-
-def _compiles() -> bool:
-    from torch.utils.cpp_extension import CUDA_HOME  # brings setuptools, which alters sys.path
-
-    return CUDA_HOME is not None
+        return CUDA_HOME is not None
+    return torch.cuda.is_available()
 
 
 class StandIns:

@@ -25,7 +25,7 @@ from fragprune_plugins.hosts.adapter import (
     optimizer_state,
 )
 from fragprune_plugins.injection.command import HostCommand
-from fragprune_plugins.injection.process import host_checkpoints
+from fragprune_plugins.injection.process import checkpoint_values
 
 log = logging.getLogger("fragprune")
 
@@ -151,17 +151,16 @@ def resumed_at(line: CommandLine, checkpoint: Path) -> int:
 @contextlib.contextmanager
 def resumable(adapter: ScriptAdapter, line: CommandLine, start: Start) -> Iterator[Path]:
     """Yields a file that the host can resume; a checkpoint made from a PLY exists only inside."""
-    if start.path.suffix != ".ply" or line.restarts:
-        adapter.expect_resumable(start.path)
-        yield start.path
-        return
-    made = start.path.with_name(line.made.format(start.iteration))
-    adapter.expect_resumable(made)
-    adapter.checkpoint_from_ply(start.path, start.iteration, made)
+    makes = start.path.suffix == ".ply" and not line.restarts
+    path = start.path.with_name(line.made.format(start.iteration)) if makes else start.path
+    adapter.expect_resumable(path)
+    if makes:
+        adapter.checkpoint_from_ply(start.path, start.iteration, path)
     try:
-        yield made
+        yield path
     finally:
-        made.unlink(missing_ok=True)
+        if makes:
+            path.unlink(missing_ok=True)
 
 
 def holds(start: Path, ply: Path) -> bool:
@@ -242,7 +241,7 @@ def _read_checkpoint(path: Path) -> tuple[Any, int]:
     """Read (capture, iteration) of a checkpoint; tensors are mapped from the file."""
     if not path.exists():
         raise UsageError(str(path), "no such file", "a checkpoint", "Check the path.")
-    with _DOOR.reading(path), host_checkpoints():
+    with _DOOR.reading(path), torch.serialization.safe_globals(checkpoint_values()):
         # The safe loader: whatever the file holds, nothing of it is run.
         capture, iteration = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
         return capture, int(iteration)

@@ -21,7 +21,7 @@ from torch import Tensor
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import AlignmentError, SessionError
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.hosts.adapter import HostAdapter, trained_groups
+from fragprune_plugins.hosts.adapter import HostAdapter
 from fragprune_plugins.hosts.dialect import Proof
 from fragprune_plugins.hosts.seams import Seam, SeamCall
 from fragprune_plugins.hosts.source import HostRepo
@@ -128,7 +128,10 @@ class SessionState:
         self.prove, self.trust = learn if prove is None else prove, trust
         self.proofs: dict[tuple[Any, ...], Proof | None] = {}  # by the shape of the call
         self.dialect = adapter.dialect(repo)
-        self.trained = trained_groups(adapter.groups, self.settings.train)  # names; None for all
+        colours = {group.name for group in adapter.groups if group.colour}
+        appearance = {"opacity"} | (colours if self.settings.train == "appearance" else set())
+        # names of the groups that stage 2 trains; None for all
+        self.trained = None if self.settings.train == "all" else appearance
         self.unpacked: tuple[Tensor, ThresholdStore] | None = None  # waits for its model
         self.similar: bool | None = None  # compiled similarity agrees with the host's own
         self.unproved: set[Seam] = set()  # rasterizers of which that was said
@@ -161,10 +164,6 @@ class SessionState:
                 )
             self.engines[device] = engine
         return self.engines[device]
-
-    def processor(self, device: torch.device) -> str:
-        """The name of a GPU, or the kind of another device."""
-        return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
 
     def model_of(self, call: SeamCall) -> Any:
         """The model that a call concerns, or None; means from the adapter identify a model too."""

@@ -10,7 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from fragprune_plugins.hosts.seams import SeamCall
@@ -199,13 +198,11 @@ def begin_step(session: SessionState, model: Any, state: ModelState) -> None:
         state.stage.close()  # before the count, because an observer may end the run here
     state.begun = True
     state.steps += 1
-    if session.standing_still(model):
-        if not state.prepared:
-            resumed = session.start > 0 or session.origin is not None
-            output = (session.origin or session.output) if resumed else None
-            session.adapter.prepare_stage2(model, output)
-            state.prepared = True
-        fill_gradients_read(session, model)
+    if session.standing_still(model) and not state.prepared:
+        resumed = session.start > 0 or session.origin is not None
+        output = (session.origin or session.output) if resumed else None
+        session.adapter.prepare_stage2(model, output)
+        state.prepared = True
     if state.stage is not None and state.steps > session.from_step:
         state.stage.begin(lambda: session.adapter.opacities(model))
 
@@ -260,13 +257,3 @@ def depends_only_on(known: set[int], value: Any) -> bool:
                 return False
         waiting += [before for before, _ in node.next_functions]
     return leaves > 0
-
-
-def fill_gradients_read(session: SessionState, model: Any) -> None:
-    """Set zero gradients on frozen parameters whose gradient the host reads."""
-    trained = session.trained
-    read = {group.name for group in session.adapter.groups if group.gradient_read}
-    for name, group in session.groups(model):
-        if trained is not None and name not in trained and name in read:
-            for parameter in group["params"]:
-                parameter.grad = torch.zeros_like(parameter)

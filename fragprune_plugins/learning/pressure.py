@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -62,8 +62,9 @@ class Observation:
     loss: float
 
 
-class PressureRule(Protocol):
-    """Gives lambda for the next step, and is told the figures of each step."""
+@dataclass
+class PressureRule:
+    """Gives lambda for the next step: ``value``."""
 
     value: float
 
@@ -71,18 +72,12 @@ class PressureRule(Protocol):
         """Take the figures of a step that is over."""
 
 
-@dataclass
-class FixedPressure:
+class FixedPressure(PressureRule):
     """Keeps lambda the same in all steps."""
 
-    value: float
-
-    def observe(self, step: Observation) -> None:
-        """Do nothing: the value is fixed."""
-
 
 @dataclass
-class ElasticPressure:
+class ElasticPressure(PressureRule):
     """A share of the loss per fragment, elasticity x loss / fragments, from least to most.
 
     Following it descends on ln(loss) + elasticity ln(fragments). Between the ends that is the same
@@ -167,7 +162,7 @@ class StepViews:
         return sum(known) if known else math.nan
 
 
-class PressureController:
+class PressureController(PressureRule):
     """Steers lambda towards a ratio of before to after: of fragments, or of what follows them.
 
     Args:

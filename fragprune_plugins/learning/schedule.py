@@ -23,27 +23,12 @@ USUAL_STOP = 0.01
 _DEFAULT_GOAL = Pressure()
 _DECAY = 0.1  # learning rates fall to this share over the run, exponentially
 
-
-@dataclass(frozen=True)
-class _Recipe:
-    """What suits one choice of what moves; docs/results.md has the runs that chose it.
-
-    Attributes:
-        steps: thresholds learn in the last so many, of one view each; None for all. Where shapes
-            follow, truncating for longer still improves the training views and no longer the
-            others.
-        elasticity: of the default pressure. Shapes that follow repair deeper cuts.
-    """
-
-    steps: int | None
-    elasticity: float
-
-
-_RECIPES: dict[Train, _Recipe] = {
-    "opacity": _Recipe(None, ELASTICITY),
-    "appearance": _Recipe(None, ELASTICITY),
-    "all": _Recipe(2000, 2 * ELASTICITY),
-}
+# Where all moves; docs/results.md has the runs that chose both.
+_LEARNING_STEPS = 2000
+"""Thresholds learn in the last so many, of one view each: where shapes follow, truncating for
+longer still improves the training views and no longer the others."""
+_ELASTICITY_OF_ALL = 2 * ELASTICITY
+"""Of the default pressure: shapes that follow repair deeper cuts."""
 
 
 @dataclass(frozen=True)
@@ -94,6 +79,9 @@ class Settings:
         def rate(value: Any) -> bool:
             return type(value) in (int, float) and 0 <= value < math.inf
 
+        def stop(value: Any) -> bool:
+            return value == "auto" or is_stop(value)
+
         checks: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
             ("iterations", whole(1, ITERATIONS_MAX), f"1 to {ITERATIONS_MAX:,}, a whole number"),
             ("train", get_args(Train).__contains__, f"one of {', '.join(get_args(Train))}"),
@@ -101,7 +89,7 @@ class Settings:
             ("threshold_lr", rate, "a number, 0 or more"),
             ("opacity_lr", rate, "a number, 0 or more"),
             ("itself", lambda value: isinstance(value, bool), "True or False"),
-            ("stop", _is_stop, "1e-4 to 1, a share of a pixel's light, 'auto' or None"),
+            ("stop", stop, "1e-4 to 1, a share of a pixel's light, 'auto' or None"),
             ("rim", (None, *get_args(Rim)).__contains__, "hard, soft or None"),
             ("dropout", lambda value: value is None or (rate(value) and value < 1), "0 to below 1"),
             ("seed", lambda value: type(value) is int, "a whole number"),
@@ -132,8 +120,8 @@ class Settings:
         Args:
             elasticity: of the default pressure; by what ``train`` names when None.
         """
-        own = _RECIPES[self.train].elasticity if elasticity is None else elasticity
-        return self.goal.pressure(own, self.itself)
+        own = _ELASTICITY_OF_ALL if self.train == "all" else ELASTICITY
+        return self.goal.pressure(own if elasticity is None else elasticity, self.itself)
 
     def stop_of(self, own: float | None) -> float | None:
         """The stop at which a model is drawn that came with its own, or with None."""
@@ -144,10 +132,9 @@ class Settings:
     @property
     def warmup(self) -> int:
         """Steps that train without truncation before thresholds open."""
-        learning = _RECIPES[self.train].steps
-        if learning is None or self.itself or self.goal.on_area:
+        if self.train != "all" or self.itself or self.goal.on_area:
             return 0
-        return max(0, self.iterations - steps_of(learning, self.views_per_step))
+        return max(0, self.iterations - steps_of(_LEARNING_STEPS, self.views_per_step))
 
     @property
     def rate(self) -> float:
@@ -157,10 +144,6 @@ class Settings:
         them one by one move a parameter by about sqrt(V) rates, and V together by one.
         """
         return math.sqrt(self.views_per_step)
-
-
-def _is_stop(value: Any) -> bool:
-    return value in (None, "auto") or (type(value) in (int, float) and is_stop(value))
 
 
 def steps_of(views: int, views_per_step: int) -> int:

@@ -419,32 +419,25 @@ class Stage2:
         put(self._views, {"expected": plain["expected"]})
         put(self.pressure, plain["pressure"])
 
-    def _ratio(self, pictures: Iterable[_Picture]) -> float:
-        """Fragments before over after, summed over pictures; infinite beyond what a target may."""
-        pictures = list(pictures)
-        before, after = (
-            sum(float(drawn[each]) for each in pictures) for drawn in (self._before, self._after)
-        )
-        return before / max(after, 1e-9) if before < FEWEST * after else math.inf
-
     def _meet_target(self, progress: float) -> None:
         """Late in the run, and again before its last step, shift all thresholds onto the target."""
-        target = self.target
-        visited = dict.fromkeys(view for view, _ in self._before)
-        views = [view for view in visited if view in self._again]
+        target, known = self.target, dict.fromkeys(view for view, _ in self._before)
+        views = evenly([view for view in known if view in self._again], CALIBRATION_VIEWS)
         due = progress >= 1.0 or (progress >= CALIBRATE_AT and not self._held)
-        if target is None or not views:
+        if target is None or not views or (self._held and not due):
             return
-        if not due and (self._held or not target.wants_look(progress)):
-            return
-        views = list(evenly(views, CALIBRATION_VIEWS))
-        pictures = [picture for picture in self._before if picture[0] in set(views)]
 
         @torch.no_grad()
         def ratio() -> float:
+            """Fragments before over after, of all views; infinite beyond what a target may."""
             for view in views:
                 self._again[view]()
-            return self._ratio(pictures)
+            pictures = [picture for picture in self._before if picture[0] in views]
+            before, after = (
+                sum(float(drawn[each]) for each in pictures)
+                for drawn in (self._before, self._after)
+            )
+            return before / max(after, 1e-9) if before < FEWEST * after else math.inf
 
         if due:
             target.meet(self.store, ratio, views)

@@ -53,12 +53,8 @@ class Target:
         """The figure's ratio that a ratio of fragments brings, to steer by."""
         return fragments
 
-    def wants_look(self, progress: float) -> bool:
-        """Whether ``look`` is due before thresholds meet the target."""
-        return False
-
     def look(self, progress: float, ratio: Callable[[], float], views: Sequence[Any]) -> None:
-        """Measure by the way; ``ratio`` and ``views`` as in ``meet``."""
+        """Measure by the way, before any step until ``meet``; ``ratio`` and ``views`` as there."""
 
     def meet(self, store: ThresholdStore, ratio: Callable[[], float], views: Sequence[Any]) -> None:
         """Shift all thresholds onto the target.

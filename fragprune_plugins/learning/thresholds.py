@@ -85,8 +85,13 @@ class ThresholdStore:
                 "(N,) falloff in (0, 1)",
                 "Correct them; ThresholdStore.from_alpha takes a limit of alpha.",
             )
-        store = cls(len(thresholds), thresholds.device, lr)
-        store._place_values(thresholds.detach().float())
+        store, values = cls(len(thresholds), thresholds.device, lr), thresholds.detach().float()
+        neutral = torch.sigmoid(torch.full_like(values, NEUTRAL_LOGIT))
+        logits = torch.logit(values)
+        store.place(torch.where(values <= neutral, logits.clamp_max(NEUTRAL_LOGIT), logits))
+        near = store.logits.detach().sigmoid()  # not rounded back: files get the bits they gave
+        same = (values - near).abs() <= _ROUNDING * near
+        store._given = store._note(torch.where(same, values, near))
         return store
 
     @classmethod
@@ -131,15 +136,6 @@ class ThresholdStore:
         if noted is None or noted[0] is not self.logits or noted[1] != self.logits._version:
             return None
         return noted[2]
-
-    def _place_values(self, values: Tensor) -> None:
-        """Set thresholds (N,) whose sigmoid is not rounded back: files get the bits they gave."""
-        neutral = torch.sigmoid(torch.full_like(values, NEUTRAL_LOGIT))
-        logits = torch.logit(values)
-        self.place(torch.where(values <= neutral, logits.clamp_max(NEUTRAL_LOGIT), logits))
-        near = self.logits.detach().sigmoid()
-        same = (values - near).abs() <= _ROUNDING * near
-        self._given = self._note(torch.where(same, values, near))
 
     @property
     def neutral(self) -> bool:

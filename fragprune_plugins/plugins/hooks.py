@@ -6,12 +6,13 @@ Every command, the session of a host and the functions of the package ask here a
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from fragprune_plugins.engines import ENGINES, Engine
+from fragprune_plugins.engines import ENGINES, Engine, create_engine
 from fragprune_plugins.errors import EngineError
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
@@ -41,12 +42,14 @@ def engine_for(
     if engine is None:
         hook = hookspecs.fragprune_create_engine
         engine = plugins.ask(hook, _no_engine, name=name, device=device)
-        if engine is None:
+        if engine is None and name in ("auto", *ENGINES):
+            engine = create_engine(name, device)
+        elif engine is None:
             raise EngineError(
                 "engine",
                 repr(name),
                 f"one of auto, {', '.join(ENGINES)}, or the name of a plugin's engine "
-                f"(plugins asked: {', '.join(plugins.answering(hook))})",
+                f"(plugins asked: {', '.join(plugins.answering(hook)) or 'none'})",
                 "Choose one; fragprune doctor lists plugins that failed to load.",
             )
         plugins.engines[name, device] = engine
@@ -86,10 +89,7 @@ def thresholds_for(
         return given
     if given.neutral:
         return None
-
-    def wrong(answer: Any) -> Wrong | None:
-        return _no_thresholds(answer, len(given), inputs.splats.device)
-
+    wrong = partial(_no_thresholds, count=len(given), device=inputs.splats.device)
     hook = hookspecs.fragprune_truncate
     answer = (plugins or installed()).ask(hook, wrong, inputs=inputs, store=given)
     return given.values if answer is None else answer

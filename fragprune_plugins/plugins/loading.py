@@ -24,7 +24,7 @@ import pluggy
 from fragprune_plugins.errors import PluginError
 from fragprune_plugins.hosts.adapter import HostAdapter, HostInfo
 from fragprune_plugins.hosts.findings import Finding
-from fragprune_plugins.plugins import hookspecs, ours
+from fragprune_plugins.plugins import hookspecs
 
 if TYPE_CHECKING:
     import torch
@@ -84,9 +84,6 @@ class Plugins:
     engines: dict[tuple[str, torch.device], Engine] = field(default_factory=dict)
     _manager: pluggy.PluginManager = field(default_factory=_manager, init=False, repr=False)
     _off: set[tuple[str, str]] = field(default_factory=set, init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        self.register(ours, ours.NAME)
 
     def register(self, plugin: object, name: str) -> None:
         """Register a plugin; if it fails, register nothing of it.
@@ -247,8 +244,6 @@ def _call(implementation: pluggy.HookImpl, hook: Hook, given: dict[str, Any]) ->
     try:
         return implementation.function(*arguments)
     except _FAULTS as error:
-        if implementation.plugin_name == ours.NAME:
-            raise
         frames = traceback.extract_tb(error.__traceback__)[1:2]  # the hook's own; the first is ours
         line = "".join(f" ({Path(each.filename).name}:{each.lineno})" for each in frames)
         plugin, found = implementation.plugin_name, _said(error) + line

@@ -19,7 +19,6 @@ from fragprune_plugins.engines.calling import (
     address,
     empty,
     expect_ok,
-    native_lengths,
     native_threads,
     plain,
 )
@@ -245,7 +244,7 @@ class _Cut:
             sh_degree_t=-1 if moment.sh_degree_t is None else moment.sh_degree_t,
             sh_coefficients=0 if sh is None else sh.shape[1],
             count=len(self.splats),
-            lengths=native_lengths(self.arrays),
+            lengths=binding.Lengths(**{k: each.numel() for k, each in self.arrays.items()}),
             **{name: address(array) for name, array in self.arrays.items()},
         )
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from fragprune_plugins.errors import InputError
-from fragprune_plugins.types import check_degree, check_tensor, one_line, require_tensor
+from fragprune_plugins.types import check_degree, check_fields, one_line
 
 if TYPE_CHECKING:
     import torch
@@ -51,17 +51,10 @@ class SpacetimeSplats:
     __repr__ = one_line
 
     def __post_init__(self) -> None:
-        require_tensor("SpacetimeSplats.means", self.means, None, 3)
+        check_fields(self, means=(None, 3))
         n = len(self.means)
-        widths: dict[str, tuple[int | None, ...]] = {
-            **dict.fromkeys(("opacities", "times", "scales_t"), ()),
-            **dict.fromkeys(("rotations", "rotations_r"), (4,)),
-            "scales": (3,),
-            "cov3d": (6,),
-            "sh": (None, 3),
-        }
-        for name, width in widths.items():
-            check_tensor(f"SpacetimeSplats.{name}", getattr(self, name), n, *width)
+        check_fields(self, opacities=(n,), times=(n,), scales=(n, 3), scales_t=(n,))
+        check_fields(self, rotations=(n, 4), rotations_r=(n, 4), cov3d=(n, 6), sh=(n, None, 3))
         given = tuple(
             getattr(self, name) is not None
             for name in ("cov3d", "scales", "rotations", "scales_t", "rotations_r")
@@ -116,7 +109,7 @@ class Moment:
     __repr__ = one_line
 
     def __post_init__(self) -> None:
-        check_tensor("Moment.campos", self.campos, 3)
+        check_fields(self, campos=(3,))
         checks = (
             ("duration", self.duration > 0, "above 0"),
             ("sh_degree_t", self.sh_degree_t in (None, 0, 1, 2), "None, 0, 1 or 2"),

@@ -16,7 +16,6 @@ from plyfile import PlyData
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.injection.launch import run
-from fragprune_plugins.injection.options import Found
 from fragprune_plugins.injection.starting import part_of
 from fragprune_plugins.learning.goals import Control
 
@@ -41,7 +40,7 @@ class Looked:
     def __call__(self, ply, photographs, settings):
         self.seen.append((ply, photographs, settings))
         kept = torch.arange(len(read_ply(ply).xyz)) % 2 == 0
-        return Found(replace(settings, dropout=0.25), kept)
+        return replace(settings, dropout=0.25), kept
 
 
 @pytest.fixture(scope="module")

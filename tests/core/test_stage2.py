@@ -234,7 +234,6 @@ def test_what_the_clock_said_outlives_a_checkpoint():
     assert again.target.seen.slope(2.0) == it.target.seen.slope(2.0) != TIME_FOLLOWS
     assert again.target.timed == it.target.timed == 2
     assert again.progress() == it.progress()
-    assert again._ratio([("a", 0)]) == it._ratio([("a", 0)])
 
 
 @pytest.mark.parametrize(("stop", "rim"), [(None, "hard"), (0.01, "soft")])

@@ -106,8 +106,7 @@ def test_photographs_are_read_once_and_a_changed_one_is_noticed(tmp_path, monkey
 def test_a_warm_up_that_was_cut_off_goes_on(model, dataset, tmp_path, monkeypatch, single_thread):
     from fragprune_plugins.learning import schedule
 
-    few = schedule._Recipe(4, 0.2)
-    monkeypatch.setitem(schedule._RECIPES, "all", few)  # thresholds open after 8 of 12 steps
+    monkeypatch.setattr(schedule, "_LEARNING_STEPS", 4)  # thresholds open after 8 of 12 steps
     whole = run(model, dataset, Settings(iterations=STEPS))
     path = tmp_path / "out.fragprune-unfinished"
     for cut in (5, 8):

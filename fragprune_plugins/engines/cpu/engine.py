@@ -19,6 +19,7 @@ from fragprune_plugins.engines.calling import (
     native_arrays,
     native_inputs,
     native_threads,
+    new_outputs,
     plain,
     with_gradients,
 )
@@ -50,29 +51,14 @@ class _Drawing:
     entries: int = 0
     stages: dict[str, float] = field(default_factory=dict)
 
-    def draw(self, wanted: Wanted) -> dict[str, Tensor | None]:
+    def draw(self, wanted: Wanted) -> dict[str, Tensor]:
         """Run the forward pass."""
-        view, splats, planes = self.inputs.view, self.inputs.splats, self.inputs.planes
-        n, size = len(splats), (view.height, view.width)
-        fresh, whole = partial(empty, self.workspace), torch.int32
-        flat = isinstance(splats, Splats) and splats.flat
-        drawn: dict[str, Tensor | None] = {
-            "image": fresh(3, *size),
-            "invdepth": fresh(int("invdepth" in planes), *size),
-            "alpha": fresh(int("alpha" in planes), *size),
-            "radii": fresh(n, dtype=whole),
-        }
-        if splats.features is not None:
-            drawn["features"] = fresh(splats.features.shape[1], *size)
-        if flat and "surface" in planes:
-            drawn["surface"] = fresh(6, *size)
-        if self.inputs.counts:
-            drawn["fragments"] = fresh(*size, dtype=whole)
-            drawn["fragments_per_gaussian"] = fresh(n, dtype=whole)
+        view, splats, fresh = self.inputs.view, self.inputs.splats, partial(empty, self.workspace)
+        drawn = new_outputs(self.inputs, fresh)
+        if isinstance(splats, Splats) and splats.flat and "surface" in self.inputs.planes:
+            drawn["surface"] = fresh(6, view.height, view.width)
         if self.inputs.scores:
-            drawn["weights_per_gaussian"] = fresh(n)
-            drawn["wins_per_gaussian"] = fresh(n, dtype=whole)
-            drawn["winners"] = fresh(*size, dtype=whole)
+            drawn["weights_per_gaussian"] = fresh(len(splats))
         outputs = binding.Outputs(**{name: address(each) for name, each in drawn.items()})
         given = native_inputs(
             self.inputs,

@@ -82,7 +82,7 @@ class CudaEngine:
                 "Move the Gaussians, or use the engine 'cpu'.",
             )
 
-    def draw(self, drawing: Drawing, wanted: Wanted) -> dict[str, Tensor | None]:
+    def draw(self, drawing: Drawing, wanted: Wanted) -> dict[str, Tensor]:
         """Run the forward pass; repeat it with more room if the lists did not fit."""
         deterministic = self._deterministic
         if deterministic is None:

@@ -9,17 +9,25 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Callable, Hashable
+from dataclasses import replace
 from functools import partial
-from typing import Final, Protocol
+from typing import Final, Protocol, get_args
 
 import torch
 from torch import Tensor
 
 from fragprune_plugins.constants import TILE
-from fragprune_plugins.engines.calling import Wanted, address, native_arrays, native_inputs, plain
+from fragprune_plugins.engines.calling import (
+    Wanted,
+    address,
+    native_arrays,
+    native_inputs,
+    new_outputs,
+    plain,
+)
 from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.errors import EngineError
-from fragprune_plugins.types import RasterInputs
+from fragprune_plugins.types import Plane, RasterInputs
 
 # What native/cuda/frame.h says.
 THREADS: Final = 256
@@ -256,9 +264,7 @@ class Drawing:
 
     # ---- forward -------------------------------------------------------------------------------
 
-    def draw(
-        self, capacity: int, wanted: Wanted, *, deterministic: bool
-    ) -> dict[str, Tensor | None]:
+    def draw(self, capacity: int, wanted: Wanted, *, deterministic: bool) -> dict[str, Tensor]:
         """Launch the forward pass. Its result is invalid if entries exceed the capacity.
 
         Args:
@@ -272,7 +278,10 @@ class Drawing:
         tiles, pixels = self._across * self._down, inputs.view.width * inputs.view.height
         keep = bool(wanted)
         cleared, scratch, kept = self._room(capacity, keep, keep and deterministic)
-        outputs = self._new_outputs()
+        everything = replace(inputs, planes=get_args(Plane))  # the kernels spare no plane
+        outputs = new_outputs(everything, partial(torch.empty, device=where))
+        for name in outputs.keys() & {"fragments_per_gaussian", "wins_per_gaussian"}:
+            outputs[name].zero_()  # the kernels add to these
         weights = torch.zeros(n, dtype=torch.int64, device=where) if inputs.scores else None
         arenas = (cleared, scratch, kept)
         places = {k: arena[k] for arena in arenas for k in arena.filled & _PLACES}
@@ -302,8 +311,9 @@ class Drawing:
         self._memory = (cleared, kept)
         self._found = found
         per_pixel = (found[2].double() / pixels).float()
-        weighed = None if weights is None else (weights.double() * 2.0**-32).float()
-        return outputs | {"fragments_per_pixel": per_pixel, "weights_per_gaussian": weighed}
+        if weights is not None:
+            outputs["weights_per_gaussian"] = (weights.double() * 2.0**-32).float()
+        return outputs | {"fragments_per_pixel": per_pixel}
 
     def _room(self, capacity: int, keep: bool, slots: bool) -> tuple[Arena, Arena, Arena]:
         """The memory of a frame.
@@ -408,25 +418,6 @@ class Drawing:
                 "Check the offsets.",
             )
         return entries
-
-    def _new_outputs(self) -> dict[str, Tensor | None]:
-        """The tensors that the kernels fill, by name; None if unwanted."""
-        inputs, n = self._inputs, self._n
-        size = (inputs.view.height, inputs.view.width)
-        new = partial(torch.empty, device=self.where)
-        zeros = partial(torch.zeros, device=self.where, dtype=torch.int32)
-        counts, scores = inputs.counts, inputs.scores
-        return {
-            "image": new(3, *size),
-            "invdepth": new(1, *size),
-            "alpha": new(1, *size),
-            "radii": new(n, dtype=torch.int32),
-            "features": new(self._channels, *size) if self._channels else None,
-            "fragments": new(*size, dtype=torch.int32) if counts else None,
-            "fragments_per_gaussian": zeros(n) if counts else None,
-            "wins_per_gaussian": zeros(n) if scores else None,
-            "winners": new(*size, dtype=torch.int32) if scores else None,
-        }
 
     # ---- backward ------------------------------------------------------------------------------
 

@@ -9,8 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -132,13 +131,7 @@ class Nvrtc:
         return tuple(results)
 
 
-@cache
-def _opened() -> Nvrtc | str:
-    """The compiler, or the reason why there is none."""
-    try:
-        return Nvrtc()
-    except Unavailable as why:
-        return str(why)
+_opened = cache(Nvrtc)
 
 
 def compiler() -> Nvrtc:
@@ -147,11 +140,9 @@ def compiler() -> Nvrtc:
     Raises:
         Unavailable: there is none, or the environment switches it off; the message says why.
     """
-    off = os.environ.get(ENVIRONMENT, "").strip().lower() in ("off", "0")
-    answer = f"switched off by {ENVIRONMENT}" if off else _opened()
-    if isinstance(answer, str):
-        raise Unavailable(answer)
-    return answer
+    if os.environ.get(ENVIRONMENT, "").strip().lower() in ("off", "0"):
+        raise Unavailable(f"switched off by {ENVIRONMENT}")
+    return _opened()
 
 
 def target_of(capability: int, architectures: tuple[int, ...]) -> str:
@@ -220,27 +211,18 @@ def image_of(
     what = repr((by.name, by.version, _OPTIONS, source, sorted(macros.items()), target))
     digest = hashlib.sha256(digest_of_sources() + what.encode()).hexdigest()[:24]
     path = cache_folder() / f"{source}-{target}-{digest}.bin"
-    with _one_at_a_time(path):
+    with ExitStack() as held:
+        # Where nothing can be locked, two processes may write the same file in turn; neither reads
+        # a partial one: a read-only folder, a lock of a process that hangs, no locks in the system.
+        with suppress(OSError, Timeout, NotImplementedError):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            held.enter_context(FileLock(f"{path}.lock", timeout=300))
         if (kept := _read(path)) is not None:
             return kept, True
         image = by.compile(source, macros, target)
         with suppress(OSError):  # read-only, or full
             _write(path, image)
         return image, False
-
-
-@contextmanager
-def _one_at_a_time(path: Path) -> Iterator[None]:
-    """Wait for other processes that write the file, if files can be locked.
-
-    Without locks two processes may write the same file in turn. Neither reads a partial file.
-    """
-    with ExitStack() as held:
-        # read-only; held by a process that hangs; file systems without locks
-        with suppress(OSError, Timeout, NotImplementedError):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            held.enter_context(FileLock(f"{path}.lock", timeout=300))
-        yield
 
 
 def _read(path: Path) -> Image | None:

@@ -62,14 +62,12 @@ class FrameTarget(Target):
         """The ratio of frame times that a ratio of fragments brings, by what was timed so far."""
         return float(fragments ** self.seen.slope(self.ratio))
 
-    def wants_look(self, progress: float) -> bool:
-        """At some shares of the learning."""
-        return self.timed < _passed(progress)
-
     def look(self, progress: float, ratio: Callable[[], float], views: Sequence[Any]) -> None:
-        """Time frames."""
-        self.timed = _passed(progress)
-        self.seen.add(ratio(), self.measure(views))
+        """Time frames, at some shares of the learning."""
+        passed = sum(progress >= share for share in CLOCKED_AT)
+        if self.timed < passed:
+            self.timed = passed
+            self.seen.add(ratio(), self.measure(views))
 
     def meet(self, store: ThresholdStore, ratio: Callable[[], float], views: Sequence[Any]) -> None:
         """Shift all thresholds onto the target, by predictions that measurements correct."""
@@ -85,10 +83,6 @@ class FrameTarget(Target):
         """Take over what ``state`` gave; raises ValueError for anything else."""
         super().load_state(state)
         self.seen = Ratios(self.seen)
-
-
-def _passed(progress: float) -> int:
-    return sum(progress >= share for share in CLOCKED_AT)
 
 
 class Ratios(list[tuple[float, float]]):

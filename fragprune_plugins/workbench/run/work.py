@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import click
+from torch import Tensor
 
 from fragprune_plugins.errors import FragpruneError
 from fragprune_plugins.files import records
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.injection import launch
-from fragprune_plugins.injection.options import Found
 from fragprune_plugins.injection.process import current_gpu
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.workbench.commands.command import JSON, Report
@@ -249,15 +249,19 @@ class Looking:
     engine: EngineOptions
     trial: Trial | None = None
 
-    def __call__(self, ply: Path, photographs: Photographs, settings: Settings) -> Found:
+    def __call__(
+        self, ply: Path, photographs: Photographs, settings: Settings
+    ) -> tuple[Settings, Tensor | None]:
         """Make the trial of ``fragprune finetune``, and score the Gaussians as it does."""
         try:
             return self._look(ply, photographs, settings)
         except FragpruneError as error:  # the host may read and draw more than we do
             log.warning("not tried whether it knows its photographs by heart, because of %s", error)
-            return Found(settings)
+            return settings, None
 
-    def _look(self, ply: Path, photographs: Photographs, settings: Settings) -> Found:
+    def _look(
+        self, ply: Path, photographs: Photographs, settings: Settings
+    ) -> tuple[Settings, Tensor | None]:
         engine, device = open_engine(self.engine)
         model, dataset = load(ply, device=device), load_photographs(photographs).to(device)
         trial, kept = tried(model, dataset, settings, engine=engine, say=log.info), None
@@ -265,4 +269,4 @@ class Looking:
             views = views_near(dataset.train, seed=settings.seed)
             kept = best(removal_error(model, model.falloff, views, engine), trial.keep).cpu()
         self.trial = trial
-        return Found(trial.settings, kept)
+        return trial.settings, kept

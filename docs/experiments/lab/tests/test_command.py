@@ -297,8 +297,7 @@ def test_other_defaults_of_the_pressure_are_another_configuration(words, trained
 
     monkeypatch.setitem(catalogue.EXPERIMENTS, "rules", default)
     run_json(*words)
-    recipe = replace(schedule._RECIPES["all"], elasticity=0.7)
-    monkeypatch.setitem(schedule._RECIPES, "all", recipe)
+    monkeypatch.setattr(schedule, "_ELASTICITY_OF_ALL", 0.7)
     result = run(*words)
     assert result.exit_code == 1
     assert "arms.learned.schedule.pressure.elasticity was 0.2 and is 0.7" in result.stderr
