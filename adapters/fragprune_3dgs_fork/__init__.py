@@ -143,30 +143,42 @@ class ForkDialect(GraphdecoDialect):
 
     def features(self, call: HostCall) -> Tensor | None:
         """(N, F) the first of the channels that are blended beside the colours."""
-        channels = self._channels(call)
-        return None if channels is None else channels[:, :CHANNELS]
+        return self._channels(call)[0]
 
-    def _channels(self, call: HostCall) -> Tensor | None:
-        """(N, F) all of them: depth, then objects."""
+    def _channels(self, call: HostCall) -> tuple[Tensor | None, Tensor | None]:
+        """(N, F) depth and objects, as far as they are drawn with the picture, and the others."""
         import torch
 
         depth, package = super().features(call), call.entry.split(":")[0]
-        wanted = "objects" in self.values(call)
-        objects = call[self.fork.blended[package]].flatten(1) if wanted else None
-        channels = [each for each in (depth, objects) if each is not None]
-        return torch.cat(channels, dim=1) if channels else None
+        if "objects" not in self.values(call):
+            return depth, None
+        objects = call[self.fork.blended[package]].flatten(1)
+        if self._detached(call):
+            return depth, objects
+        channels = objects if depth is None else torch.cat([depth, objects], dim=1)
+        return channels[:, :CHANNELS], channels[:, CHANNELS:]
+
+    def _detached(self, call: HostCall) -> bool:
+        return any(each.detached for each in self._outputs(call))
 
     def answer(
         self, call: HostCall, inputs: RasterInputs, draw: Callable[..., RasterOutputs]
     ) -> Any:
-        """Draw and pack; several times if there are more channels than an engine blends."""
+        """Draw and pack; several times if there are more channels than an engine blends.
+
+        Channels that move no Gaussian may still move its threshold, which cuts them, too.
+        """
         import torch
 
-        outputs, channels = draw(inputs), self._channels(call)
-        if channels is not None:
-            rest = torch.split(channels, CHANNELS, dim=1)[1:]
-            splats = (replace(inputs.splats, features=each) for each in rest)
-            drawn = [outputs, *(draw(replace(inputs, splats=each)) for each in splats)]
+        outputs, (_, others) = draw(inputs), self._channels(call)
+        if others is not None:
+            splats: Any = inputs.splats
+            if self._detached(call):
+                still = {k: v.detach() for k, v in vars(splats).items() if hasattr(v, "detach")}
+                inputs, splats = replace(inputs, means2d_hook=None), replace(splats, **still)
+            parts = torch.split(others, CHANNELS, dim=1)
+            further = (replace(splats, features=each) for each in parts)
+            drawn = [outputs, *(draw(replace(inputs, splats=each)) for each in further)]
             blended = [each.features for each in drawn if each.features is not None]
             outputs = replace(outputs, features=torch.cat(blended))
         return self.pack(outputs, call)

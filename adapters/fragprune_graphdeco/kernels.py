@@ -79,6 +79,12 @@ def normal_sources(repo: HostRepo, package: str) -> list[str]:
     ]
 
 
+def backward_sources(repo: HostRepo, package: str) -> str:
+    """Likewise what differentiates them, as one text."""
+    files = (path for each in vendored(repo, package) for path in sorted(each.rglob("backward.cu")))
+    return "".join(_normal(_COMMENT.sub("", repo.read(path))) for path in files)
+
+
 _read: WeakKeyDictionary[HostRepo, dict[str, list[_Project]]] = WeakKeyDictionary()
 
 

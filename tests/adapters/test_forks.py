@@ -91,6 +91,23 @@ def test_every_value_is_in_its_place_with_its_gradient(scene, objects):
     torch.testing.assert_close(found, expected)
 
 
+def test_channels_that_move_no_gaussian_get_their_gradient_alone(scene, objects):
+    roles = (*VALUES["p"][:2], Output("objects", "objects", detached=True), *VALUES["p"][3:])
+    dialect = replace(DIALECT, fork=replace(FORK, outputs={"p": roles}))
+    engine, call = create_engine("reference"), call_of(scene, objects.requires_grad_(True))
+
+    def answered(by):
+        return by.answer(call, by.unpack(call), lambda each: engine.rasterize(each, None))
+
+    values, moving = (dict(zip(ROLES, answered(by), strict=True)) for by in (dialect, DIALECT))
+    torch.testing.assert_close(values["objects"], moving["objects"])
+    torch.testing.assert_close(values["depth"], moving["depth"])
+    leaves = (scene.splats.means, objects)
+    means, found = torch.autograd.grad(values["objects"].sum(), leaves)
+    assert not means.any()
+    torch.testing.assert_close(found, torch.autograd.grad(moving["objects"].sum(), objects)[0])
+
+
 READS = {
     "a sum": lambda value: value + 1,
     "a sum, turned round": lambda value: 1 + value,
