@@ -359,14 +359,22 @@ def _drawing(repo: HostRepo, module: str) -> list[ast.FunctionDef]:
     return sorted(found, key=lambda each: each.name != "render")
 
 
-def _call(function: ast.AST) -> ast.Call | None:
-    """The first call that draws."""
+def _call(function: ast.AST, off: Collection[str] = ()) -> ast.Call | None:
+    """The first call that draws, one that needs no argument that is off if there is any."""
+    needy = [node for node in nodes(function) if isinstance(node, ast.If) and _needs(node, off)]
+    behind = {id(inner) for node in needy for each in node.body for inner in nodes(each)}
     calls = [
         node
         for node in nodes(function)
         if isinstance(node, ast.Call) and any(each.arg == "means3D" for each in node.keywords)
     ]
-    return min(calls, key=lambda each: each.lineno, default=None)
+    return min(calls, key=lambda each: (id(each) in behind, each.lineno), default=None)
+
+
+def _needs(node: ast.If, off: Collection[str]) -> bool:
+    """Whether a branch is taken only if one of these arguments is given."""
+    test = ast.unparse(node.test)
+    return any(re.fullmatch(rf"{each}( is not None)?", test) for each in off)
 
 
 class Drawing:
@@ -401,7 +409,7 @@ class Drawing:
             and isinstance(node.value, ast.Name)
         ]
         self.model = models[0] if models else "pc"
-        self.call = _call(function)
+        self.call = _call(function, self.off)
         self.colours = set[str]()
         named = (*self.parameters, self.model)
         self.made: dict[str, tuple[str, ...]] = {each: (each,) for each in named}
@@ -417,9 +425,7 @@ class Drawing:
             before = self.made
             if isinstance(node, ast.If):
                 test = ast.unparse(node.test)
-                on = self._is_colour_option(node) or any(
-                    re.fullmatch(rf"{each}( is not None)?", test) for each in self.off
-                )
+                on = self._is_colour_option(node) or _needs(node, self.off)
                 none = any(re.fullmatch(rf"{each} is None|not {each}", test) for each in self.off)
                 self._collect([] if on else node.body)
                 if not none:

@@ -82,6 +82,15 @@ CLAMPED = """rotations=rotations
 """
 
 
+BOXED = """
+    if training:
+        boxed, shades = pc.get_xyz[pc.box], pc.get_features[pc.box]
+        image, radii, depth, used = rasterizer(means3D=boxed, opacities=faint, shs=shades, colors_precomp=lit)
+        return {"render": image}
+    means3D = pc.get_xyz
+"""
+
+
 @pytest.fixture
 def fork(tmp_path):
     """A fork whose PLY is plain 3DGS and that no adapter fits; replaces text in its files."""
@@ -226,6 +235,7 @@ def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):
             "class GaussianModel:",
             f"class GaussianModel2D:{GROWS}(self): ...\n\n\nclass GaussianModel:",
         ),
+        ("\n    means3D = pc.get_xyz\n", BOXED),
         (".repeat(1, 3)", "\n        scales = scales if self.round else scales.repeat(1, 3)"),
     ],
 )
