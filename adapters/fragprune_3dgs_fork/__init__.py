@@ -29,7 +29,7 @@ from fragprune_3dgs_fork.fork import (
     rests_after_densification,
 )
 from fragprune_3dgs_fork.rasterizer import Output
-from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, plain, reading
+from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, kernels, plain, reading
 from fragprune_plugins.adapting import (
     CommandLine,
     EngineError,
@@ -271,6 +271,12 @@ class ForkAdapter(GraphdecoAdapter):
         return [
             *self.other_host(repo, [*reading.renamed(repo), *reading.compiled(repo, fork.scripts)]),
             *fork.findings,
+            *(
+                each
+                for package in fork.outputs
+                for each in kernels.read_kernels(repo, package, kernels.SPLAT)
+                if each.code == kernels.ORDER
+            ),
             *read_getters(fork),
             *(reading.read_flags(repo, served) if fork.scripts else ()),
             *self._groups(repo),

@@ -21,10 +21,11 @@ _COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/", re.DOTALL)
 _ALPHA = re.compile(r"\b(?:float|double|auto)\s+alpha\s*=([^;]+);")
 _JACOBIAN = re.compile(r"\bJ\s*=\s*glm::mat3(?:x3)?\s*(\([^;]+\))\s*;")
 _FILTER = re.compile(r"\bcov(?:\[0\]\[0\]|\.x)\s*\+=?\s*([\w.]+)")
-_EWA = re.compile(
+_EWA = re.compile(  # the third row is of depth: no picture has it
     r"\((\w+)/(\w+)\.z,0\.?0?,-\(?\1\*\2\.x\)?/\(\2\.z\*\2\.z\),"
-    r"0\.?0?,(\w+)/\2\.z,-\(?\3\*\2\.y\)?/\(\2\.z\*\2\.z\),0\.?0?,0\.?0?,0\.?0?\)"
+    r"0\.?0?,(\w+)/\2\.z,-\(?\3\*\2\.y\)?/\(\2\.z\*\2\.z\),[^,]+,[^,]+,[^,]+\)"
 )
+_ORDER = re.compile(r"\bdepths\[idx\]\s*=([^;]+);")
 _QUADRATIC = re.compile(
     r"-0\.5\*\((\w+)\.x\*(\w+)\.x\*\2\.x\+\1\.z\*\2\.y\*\2\.y\)-\1\.y\*\2\.x\*\2\.y"
 )
@@ -34,6 +35,8 @@ _POLYNOMIAL = re.compile(r"[\w.+()-]*(?:\*[\w.+()-]+){5,}")
 _LAUNCH = re.compile(r"\b(\w+)\s*(?:<[^<>;]*>)?\s*<<\s*<")
 _KERNEL = re.compile(r"__global__[^;{(]*?(?:__launch_bounds__\s*\([^)]*\)\s*)?(\w+)\s*\(")
 _LOW_PASS = 0.3
+ORDER = "order"
+"""The code of an error that is of the picture alone: a PLY is drawn in any order."""
 
 
 @dataclass(frozen=True)
@@ -178,6 +181,10 @@ class _Project:
                         "the EWA projection",
                     )
             yield from self._filters()
+            for path, position, text in self._found(_ORDER):
+                if not re.fullmatch(r"\w*view\w*\.z", text):
+                    found = f"Gaussians sorted by {_short(text)}"
+                    yield self._finding(path, position, found, "z in view space", code=ORDER)
 
     def _alphas(self, kernel: Kernel) -> Iterator[Finding]:
         drawn, known, unread = self._launched(), 0, []
@@ -252,14 +259,21 @@ class _Project:
                 yield path, match.start(), _normal(match[1])
 
     def _finding(
-        self, path: Path, position: int, found: str, expected: str, *, error: bool = True
+        self,
+        path: Path,
+        position: int,
+        found: str,
+        expected: str,
+        *,
+        error: bool = True,
+        code: str = "kernel",
     ) -> Finding:
         at = path.relative_to(self.repo.root).as_posix()
         if path in self.texts:
             at += f":{self.texts[path].count(chr(10), 0, position) + 1}"
         return Finding(
             "error" if error else "warning",
-            "kernel",
+            code,
             f"{self.package} ({at})",
             found,
             expected,

@@ -98,6 +98,15 @@ def test_a_sum_is_known_in_any_spelling(tmp_path, what):
     assert read_fork(repo).outputs["diff_gaussian_rasterization"][2].role == role
 
 
+def test_gaussians_in_another_order_are_another_picture_of_a_plain_ply(tmp_path):
+    assert errors(fork(tmp_path / "z", kernel="depths[idx] = p_view.z;")) == []
+    repo = fork(tmp_path / "distance", kernel="depths[idx] = length(p_view);")
+    assert "Gaussians sorted by length(p_view)" in errors(repo)[0]
+    plugins = load_plugins()
+    verdict = judge(repo, attempt(repo, plugins.adapters), plugins.adapters, plugins)
+    assert verdict.kind == "finetune"
+
+
 def test_a_value_that_no_proof_can_tell_is_refused(tmp_path):
     used = (USED[0], USED[1].format("median_depth"))
     repo = fork(tmp_path, used, values="image, radii, median_depth")

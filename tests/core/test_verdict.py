@@ -85,7 +85,9 @@ CLAMPED = """rotations=rotations
 BOXED = """
     if training:
         boxed, shades = pc.get_xyz[pc.box], pc.get_features[pc.box]
-        image, radii, depth, used = rasterizer(means3D=boxed, opacities=faint, shs=shades, colors_precomp=lit)
+        image, radii, depth, used = rasterizer(
+            means3D=boxed, opacities=faint, shs=shades, colors_precomp=lit
+        )
         return {"render": image}
     means3D = pc.get_xyz
 """
