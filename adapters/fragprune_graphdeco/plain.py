@@ -476,7 +476,7 @@ class Drawing:
         """What an expression is made of: "model.x", parameters, and "model" itself."""
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
             if self.made.get(node.value.id) == (self.model,):
-                yield f"{self.model}.{node.attr}"
+                yield from (f"{self.model}.{each}" for each in self._given_by(node.attr))
                 return
             yield from self._roots(node.value)
         elif isinstance(node, ast.Name):
@@ -490,6 +490,15 @@ class Drawing:
                 part = child.value if isinstance(child, ast.keyword) else child
                 if isinstance(part, ast.expr):
                     yield from self._roots(part)
+
+    def _given_by(self, name: str) -> list[str]:
+        """The attributes of the model that an attribute gives: itself, or what its method does."""
+        method = self.repo.function("scene.gaussian_model", f"GaussianModel.{name}")
+        body = method.body[-1] if method and len(method.body) == 1 else None
+        value = body.value if isinstance(body, ast.Return) else None
+        given = value.elts if isinstance(value, ast.Tuple) else []
+        own = [each.attr for each in given if re.fullmatch(r"self\.\w+", ast.unparse(each))]  # type: ignore[attr-defined]
+        return own if own and len(own) == len(given) else [name]
 
     def selection(self) -> str:
         """The code that picks rows of what is drawn first, as ``means3D[mask]``; "" without any."""
