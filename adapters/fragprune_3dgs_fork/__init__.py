@@ -159,7 +159,7 @@ class ForkDialect(GraphdecoDialect):
         return channels[:, :CHANNELS], channels[:, CHANNELS:]
 
     def _detached(self, call: HostCall) -> bool:
-        return any(each.detached for each in self._outputs(call))
+        return any(each.detached and each.role == "objects" for each in self._outputs(call))
 
     def answer(
         self, call: HostCall, inputs: RasterInputs, draw: Callable[..., RasterOutputs]
@@ -216,7 +216,7 @@ class ForkDialect(GraphdecoDialect):
             if value.role in IN_PLACE:
                 return IN_PLACE[value.role](value.name)
             if value.role not in ("count", "weight"):
-                return made
+                return made.detach() if value.detached and value.role != "objects" else made
             made = made[:, None] if value.column else made
             return made.int() if value.integer else made.float()
 

@@ -34,8 +34,8 @@ _INVERSE = re.compile(r"(\w+)\+=\(1/depths\[collected_id\[j\]\]\)\*alpha\*T;")
 _WEIGHT = re.compile(r"(\w+)\+=alpha\*T;")
 _BLENDED = re.compile(r"(\w+)\[ch\]\+=\w+\[collected_id\[j\]\*\w+\+ch\]\*alpha\*T;")
 """A sum over the ray for each channel."""
-_PULLED = re.compile(r"dL_dalpha\+=\(\w+-accum_\w+\[ch\]\)\*")
-"""What a channel adds to the gradient of alpha: the colours' do in every one of them."""
+_PULLED = re.compile(r"dL_dalpha\+=\(?\([\w.]+-accum_\w+(\[ch\])?\)\*")
+"""What a sum adds to the gradient of alpha: one over channels, as that of colours, or another."""
 _ADDED = re.compile(r"([{;])atomicAdd\(&\(?(\w+)\[collected_id\[j\]\]\)?,(alpha\*T|1\.?0?)\);")
 """A sum for each Gaussian over its fragments, in a statement of its own."""
 _DRAWN = re.compile(r"if\(test_T<0\.0001\)\{done=true;continue;\}")
@@ -53,7 +53,7 @@ class Output:
             host's own rasterizer can tell.
         column: of one number per Gaussian, whether it is (P, 1), not (P,).
         integer: likewise, whether it is int32.
-        detached: of blended channels, whether their gradient moves no Gaussian.
+        detached: whether no gradient of it moves a Gaussian.
     """
 
     name: str
@@ -73,17 +73,25 @@ def meaning(repo: HostRepo, call: graphdeco.CallInSource, name: str) -> Output:
         made = re.search(rf"{name}=torch::\w+\(\{{\w+(,1)?\}}[^;]*;", text)
         whole = made is not None and "kInt" in made[0]
         return Output(name, role, column=bool(made and made[1]), integer=whole)
+    blended, (moved, flat) = blended_argument(repo, call), _moving(repo, call.package)
     if "depth" in name:
         for rule, known in ((_DEPTH, "depth"), (_INVERSE, "invdepth")):
             if _written(text, name, "depth", rule):
-                return Output(name, known)  # type: ignore[arg-type]
+                return Output(name, known, detached=flat)  # type: ignore[arg-type]
     elif re.search(r"alpha|acc|opac", name) and _written(text, name, "alpha|opac", _WEIGHT):
-        return Output(name, "alpha")
-    elif blended_argument(repo, call) and _words(name) & _words(_blended(text)):
-        backward = kernels.backward_sources(repo, call.package)
-        if not backward or (pulled := len(set(_PULLED.findall(backward)))):
-            return Output(name, "objects", detached=bool(backward) and pulled == 1)
+        return Output(name, "alpha", detached=flat)
+    elif blended and moved is not None and _words(name) & _words(_blended(text)):
+        return Output(name, "objects", detached=not moved)
     return Output(name, "unread")
+
+
+def _moving(repo: HostRepo, package: str) -> tuple[bool | None, bool]:
+    """Whether blended channels move Gaussians, None if unknown; whether no other sum does."""
+    text = kernels.backward_sources(repo, package)
+    pulled = {match[0]: match[1] for match in _PULLED.finditer(text)}
+    colours = sum(each is not None for each in pulled.values())
+    moved = not text or (colours > 1 if colours else None)
+    return moved, bool(colours) and colours == len(pulled)
 
 
 def _inlined(text: str) -> str:

@@ -154,6 +154,18 @@ def test_the_backward_pass_says_whether_channels_move_gaussians(tmp_path, what):
     assert read_fork(repo).outputs["diff_gaussian_rasterization"][2].detached is detached
 
 
+OF_DEPTH = "dL_dalpha += (z - accum_depth) * dL_ddepth;"
+
+
+@pytest.mark.parametrize("further", [OF_DEPTH, ""], ids=["moves", "moves nothing"])
+def test_the_backward_pass_says_whether_a_depth_moves_gaussians(tmp_path, further):
+    fork(tmp_path, (USED[0], USED[1].format("depth")), values="image, radii, depth", kernel=DEPTH)
+    text = PULL.format("c", "rec", "dchannel") + further
+    (tmp_path / "submodules/a/backward.cu").write_text(text)
+    (*_, depth) = read_fork(HostRepo(tmp_path)).outputs["diff_gaussian_rasterization"]
+    assert (depth.role, depth.detached) == ("depth", not further)
+
+
 DRAWN = "if (test_T < 0.0001f) { done = true; continue; }"
 SUM = "{drawn} C[ch] += c * alpha * T; {before} T = test_T; {behind}"
 ADDED = "atomicAdd(&(hits[collected_id[j]]), {});"
