@@ -11,7 +11,7 @@ import logging
 from argparse import ArgumentParser
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -29,7 +29,8 @@ from fragprune_3dgs_fork.fork import (
     rests_after_densification,
 )
 from fragprune_3dgs_fork.rasterizer import Output
-from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, kernels, plain, reading
+from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, plain, reading
+from fragprune_graphdeco.kernels import ORDER, SPLAT, read_kernels
 from fragprune_plugins.adapting import (
     CommandLine,
     EngineError,
@@ -268,15 +269,11 @@ class ForkAdapter(GraphdecoAdapter):
             return [Finding.error("not-plain", MODEL, others[0], "a plain 3DGS model")]
         fork = read_fork(repo)
         served = replace(self.command_line(repo), scripts=fork.scripts)
+        read = partial(read_kernels, repo, kernel=SPLAT)
         return [
             *self.other_host(repo, [*reading.renamed(repo), *reading.compiled(repo, fork.scripts)]),
             *fork.findings,
-            *(
-                each
-                for package in fork.outputs
-                for each in kernels.read_kernels(repo, package, kernels.SPLAT)
-                if each.code == kernels.ORDER
-            ),
+            *(each for found in map(read, fork.outputs) for each in found if each.code == ORDER),
             *read_getters(fork),
             *(reading.read_flags(repo, served) if fork.scripts else ()),
             *self._groups(repo),

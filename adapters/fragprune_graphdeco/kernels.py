@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from weakref import WeakKeyDictionary
 
@@ -184,7 +184,8 @@ class _Project:
             for path, position, text in self._found(_ORDER):
                 if not re.fullmatch(r"\w*view\w*\.z", text):
                     found = f"Gaussians sorted by {_short(text)}"
-                    yield self._finding(path, position, found, "z in view space", code=ORDER)
+                    finding = self._finding(path, position, found, "z in view space")
+                    yield replace(finding, code=ORDER)
 
     def _alphas(self, kernel: Kernel) -> Iterator[Finding]:
         drawn, known, unread = self._launched(), 0, []
@@ -259,21 +260,14 @@ class _Project:
                 yield path, match.start(), _normal(match[1])
 
     def _finding(
-        self,
-        path: Path,
-        position: int,
-        found: str,
-        expected: str,
-        *,
-        error: bool = True,
-        code: str = "kernel",
+        self, path: Path, position: int, found: str, expected: str, *, error: bool = True
     ) -> Finding:
         at = path.relative_to(self.repo.root).as_posix()
         if path in self.texts:
             at += f":{self.texts[path].count(chr(10), 0, position) + 1}"
         return Finding(
             "error" if error else "warning",
-            code,
+            "kernel",
             f"{self.package} ({at})",
             found,
             expected,
