@@ -11,7 +11,7 @@ import logging
 from argparse import ArgumentParser
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -30,6 +30,7 @@ from fragprune_3dgs_fork.fork import (
 )
 from fragprune_3dgs_fork.rasterizer import Output
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, plain, reading
+from fragprune_graphdeco.kernels import ORDER, SPLAT, read_kernels
 from fragprune_plugins.adapting import (
     CommandLine,
     EngineError,
@@ -143,30 +144,42 @@ class ForkDialect(GraphdecoDialect):
 
     def features(self, call: HostCall) -> Tensor | None:
         """(N, F) the first of the channels that are blended beside the colours."""
-        channels = self._channels(call)
-        return None if channels is None else channels[:, :CHANNELS]
+        return self._channels(call)[0]
 
-    def _channels(self, call: HostCall) -> Tensor | None:
-        """(N, F) all of them: depth, then objects."""
+    def _channels(self, call: HostCall) -> tuple[Tensor | None, Tensor | None]:
+        """(N, F) depth and objects, as far as they are drawn with the picture, and the others."""
         import torch
 
         depth, package = super().features(call), call.entry.split(":")[0]
-        wanted = "objects" in self.values(call)
-        objects = call[self.fork.blended[package]].flatten(1) if wanted else None
-        channels = [each for each in (depth, objects) if each is not None]
-        return torch.cat(channels, dim=1) if channels else None
+        if "objects" not in self.values(call):
+            return depth, None
+        objects = call[self.fork.blended[package]].flatten(1)
+        if self._detached(call):
+            return depth, objects
+        channels = objects if depth is None else torch.cat([depth, objects], dim=1)
+        return channels[:, :CHANNELS], channels[:, CHANNELS:]
+
+    def _detached(self, call: HostCall) -> bool:
+        return any(each.detached and each.role == "objects" for each in self._outputs(call))
 
     def answer(
         self, call: HostCall, inputs: RasterInputs, draw: Callable[..., RasterOutputs]
     ) -> Any:
-        """Draw and pack; several times if there are more channels than an engine blends."""
+        """Draw and pack; several times if there are more channels than an engine blends.
+
+        Channels that move no Gaussian may still move its threshold, which cuts them, too.
+        """
         import torch
 
-        outputs, channels = draw(inputs), self._channels(call)
-        if channels is not None:
-            rest = torch.split(channels, CHANNELS, dim=1)[1:]
-            splats = (replace(inputs.splats, features=each) for each in rest)
-            drawn = [outputs, *(draw(replace(inputs, splats=each)) for each in splats)]
+        outputs, (_, others) = draw(inputs), self._channels(call)
+        if others is not None:
+            splats: Any = inputs.splats
+            if self._detached(call):
+                still = {k: v.detach() for k, v in vars(splats).items() if hasattr(v, "detach")}
+                inputs, splats = replace(inputs, means2d_hook=None), replace(splats, **still)
+            parts = torch.split(others, CHANNELS, dim=1)
+            further = (replace(splats, features=each) for each in parts)
+            drawn = [outputs, *(draw(replace(inputs, splats=each)) for each in further)]
             blended = [each.features for each in drawn if each.features is not None]
             outputs = replace(outputs, features=torch.cat(blended))
         return self.pack(outputs, call)
@@ -204,7 +217,7 @@ class ForkDialect(GraphdecoDialect):
             if value.role in IN_PLACE:
                 return IN_PLACE[value.role](value.name)
             if value.role not in ("count", "weight"):
-                return made
+                return made.detach() if value.detached and value.role != "objects" else made
             made = made[:, None] if value.column else made
             return made.int() if value.integer else made.float()
 
@@ -256,9 +269,11 @@ class ForkAdapter(GraphdecoAdapter):
             return [Finding.error("not-plain", MODEL, others[0], "a plain 3DGS model")]
         fork = read_fork(repo)
         served = replace(self.command_line(repo), scripts=fork.scripts)
+        read = partial(read_kernels, repo, kernel=SPLAT)
         return [
             *self.other_host(repo, [*reading.renamed(repo), *reading.compiled(repo, fork.scripts)]),
             *fork.findings,
+            *(each for found in map(read, fork.outputs) for each in found if each.code == ORDER),
             *read_getters(fork),
             *(reading.read_flags(repo, served) if fork.scripts else ()),
             *self._groups(repo),

@@ -26,11 +26,16 @@ Role = Literal[
     "unread",
 ]
 
-_DEPTH = re.compile(r"(\w+)\+=depths\[collected_id\[j\]\]\*alpha\*T;")
+_Z = r"depths\[collected_id\[j\]\]"
+_DECLARED = re.compile(r"(?:float|auto)(\w+)=([^;]+);")
+_FACTOR = re.compile(rf"{_Z}|alpha\*T")
+_DEPTH = re.compile(rf"(\w+)\+=(?:{_Z}\*alpha\*T|alpha\*T\*{_Z});")
 _INVERSE = re.compile(r"(\w+)\+=\(1/depths\[collected_id\[j\]\]\)\*alpha\*T;")
 _WEIGHT = re.compile(r"(\w+)\+=alpha\*T;")
 _BLENDED = re.compile(r"(\w+)\[ch\]\+=\w+\[collected_id\[j\]\*\w+\+ch\]\*alpha\*T;")
 """A sum over the ray for each channel."""
+_PULLED = re.compile(r"dL_dalpha\+=\(?\([\w.]+-accum_\w+(\[ch\])?\)\*")
+"""What a sum adds to the gradient of alpha: one over channels, as that of colours, or another."""
 _ADDED = re.compile(r"([{;])atomicAdd\(&\(?(\w+)\[collected_id\[j\]\]\)?,(alpha\*T|1\.?0?)\);")
 """A sum for each Gaussian over its fragments, in a statement of its own."""
 _DRAWN = re.compile(r"if\(test_T<0\.0001\)\{done=true;continue;\}")
@@ -48,12 +53,14 @@ class Output:
             host's own rasterizer can tell.
         column: of one number per Gaussian, whether it is (P, 1), not (P,).
         integer: likewise, whether it is int32.
+        detached: whether no gradient of it moves a Gaussian.
     """
 
     name: str
     role: Role
     column: bool = False
     integer: bool = False
+    detached: bool = False
 
 
 def meaning(repo: HostRepo, call: graphdeco.CallInSource, name: str) -> Output:
@@ -61,28 +68,56 @@ def meaning(repo: HostRepo, call: graphdeco.CallInSource, name: str) -> Output:
     late = "antialiasing" in call.settings and len(call.names) == 3
     if late and call.package == "diff_gaussian_rasterization":
         return Output(name, "invdepth")  # the rasterizer since August 2024
-    text = "".join(kernels.normal_sources(repo, call.package))
+    text = _inlined("".join(kernels.normal_sources(repo, call.package)))
     if role := _sum_for_gaussians(text, name):
         made = re.search(rf"{name}=torch::\w+\(\{{\w+(,1)?\}}[^;]*;", text)
         whole = made is not None and "kInt" in made[0]
         return Output(name, role, column=bool(made and made[1]), integer=whole)
+    blended, (moved, flat) = blended_argument(repo, call), _moving(repo, call.package)
     if "depth" in name:
         for rule, known in ((_DEPTH, "depth"), (_INVERSE, "invdepth")):
-            if _written(text, rule, r"out_\w*depth\w*"):
-                return Output(name, known)  # type: ignore[arg-type]
-    elif re.search(r"alpha|acc|opac", name) and _written(text, _WEIGHT, r"out_(alpha|opac)\w*"):
-        return Output(name, "alpha")
-    elif blended_argument(repo, call) and _words(name) & _words(_blended(text)):
-        return Output(name, "objects")
+            if _written(text, name, "depth", rule):
+                return Output(name, known, detached=flat)  # type: ignore[arg-type]
+    elif re.search(r"alpha|acc|opac", name) and _written(text, name, "alpha|opac", _WEIGHT):
+        return Output(name, "alpha", detached=flat)
+    elif blended and moved is not None and _words(name) & _words(_blended(text)):
+        return Output(name, "objects", detached=not moved)
     return Output(name, "unread")
 
 
-def _written(text: str, rule: re.Pattern[str], buffer: str) -> bool:
-    """Whether a sum goes into a buffer as it is, and nothing else does."""
-    found = rule.search(text)
-    stored = re.findall(rf"\b{buffer}\[pix_id\]=([^;]+);", text)
-    values = [each[-1] if isinstance(each, tuple) else each for each in stored]
-    return found is not None and bool(values) and set(values) == {found[1]}
+def _moving(repo: HostRepo, package: str) -> tuple[bool | None, bool]:
+    """Whether blended channels move Gaussians, None if unknown; whether no other sum does."""
+    text = kernels.backward_sources(repo, package)
+    pulled = {match[0]: match[1] for match in _PULLED.finditer(text)}
+    colours = sum(each is not None for each in pulled.values())
+    moved = not text or (colours > 1 if colours else None)
+    return moved, bool(colours) and colours == len(pulled)
+
+
+def _inlined(text: str) -> str:
+    """Sources in which a fragment's depth and weight have no other names."""
+    declared: dict[str, set[str]] = {}
+    for name, value in _DECLARED.findall(text):
+        declared.setdefault(name, set()).add(value)
+    for name, values in declared.items():
+        value = values.pop()
+        changed = re.search(rf"(?<![\w.]){name}[-+*/]?=", text)
+        if not values and not changed and _FACTOR.fullmatch(value):
+            text = re.sub(rf"(?<![\w.]){name}\b", value, text)
+    return text
+
+
+def _written(text: str, name: str, buffer: str, rule: re.Pattern[str]) -> bool:
+    """Whether a sum, and nothing else, goes into the buffer that is called most like a value."""
+    stored: dict[str, set[str]] = {}
+    for own, value in re.findall(rf"\bout_(\w*(?:{buffer})\w*)\[pix_id\]=([^;]+);", text):
+        stored.setdefault(own, set()).add(value)
+    named = [each for each in stored if _words(each) <= _words(name)]
+    values = set().union(*(stored[each] for each in named or stored))
+    sums = set(rule.findall(text))
+    if rule is _WEIGHT and "T=test_T;" in text:
+        sums.add("1-T")
+    return bool(values) and values <= sums
 
 
 def blended_argument(repo: HostRepo, call: graphdeco.CallInSource) -> str:

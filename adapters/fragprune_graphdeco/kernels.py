@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from weakref import WeakKeyDictionary
 
@@ -21,10 +21,11 @@ _COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/", re.DOTALL)
 _ALPHA = re.compile(r"\b(?:float|double|auto)\s+alpha\s*=([^;]+);")
 _JACOBIAN = re.compile(r"\bJ\s*=\s*glm::mat3(?:x3)?\s*(\([^;]+\))\s*;")
 _FILTER = re.compile(r"\bcov(?:\[0\]\[0\]|\.x)\s*\+=?\s*([\w.]+)")
-_EWA = re.compile(
+_EWA = re.compile(  # the third row is of depth: no picture has it
     r"\((\w+)/(\w+)\.z,0\.?0?,-\(?\1\*\2\.x\)?/\(\2\.z\*\2\.z\),"
-    r"0\.?0?,(\w+)/\2\.z,-\(?\3\*\2\.y\)?/\(\2\.z\*\2\.z\),0\.?0?,0\.?0?,0\.?0?\)"
+    r"0\.?0?,(\w+)/\2\.z,-\(?\3\*\2\.y\)?/\(\2\.z\*\2\.z\),[^,]+,[^,]+,[^,]+\)"
 )
+_ORDER = re.compile(r"\bdepths\[idx\]\s*=([^;]+);")
 _QUADRATIC = re.compile(
     r"-0\.5\*\((\w+)\.x\*(\w+)\.x\*\2\.x\+\1\.z\*\2\.y\*\2\.y\)-\1\.y\*\2\.x\*\2\.y"
 )
@@ -34,6 +35,8 @@ _POLYNOMIAL = re.compile(r"[\w.+()-]*(?:\*[\w.+()-]+){5,}")
 _LAUNCH = re.compile(r"\b(\w+)\s*(?:<[^<>;]*>)?\s*<<\s*<")
 _KERNEL = re.compile(r"__global__[^;{(]*?(?:__launch_bounds__\s*\([^)]*\)\s*)?(\w+)\s*\(")
 _LOW_PASS = 0.3
+ORDER = "order"
+"""The code of an error that is of the picture alone: a PLY is drawn in any order."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,12 @@ def normal_sources(repo: HostRepo, package: str) -> list[str]:
     return [
         _normal(text) for project in _projects(repo, package) for text in project.texts.values()
     ]
+
+
+def backward_sources(repo: HostRepo, package: str) -> str:
+    """Likewise what differentiates them, as one text."""
+    files = (path for each in vendored(repo, package) for path in sorted(each.rglob("backward.cu")))
+    return "".join(_normal(_COMMENT.sub("", repo.read(path))) for path in files)
 
 
 _read: WeakKeyDictionary[HostRepo, dict[str, list[_Project]]] = WeakKeyDictionary()
@@ -172,6 +181,11 @@ class _Project:
                         "the EWA projection",
                     )
             yield from self._filters()
+            for path, position, text in self._found(_ORDER):
+                if not re.fullmatch(r"\w*view\w*\.z", text):
+                    found = f"Gaussians sorted by {_short(text)}"
+                    finding = self._finding(path, position, found, "z in view space")
+                    yield replace(finding, code=ORDER)
 
     def _alphas(self, kernel: Kernel) -> Iterator[Finding]:
         drawn, known, unread = self._launched(), 0, []

@@ -15,7 +15,7 @@ from weakref import WeakKeyDictionary
 
 from fragprune_graphdeco import reading
 from fragprune_graphdeco.call import RASTERIZER, read_calls
-from fragprune_graphdeco.kernels import SPLAT, read_kernels
+from fragprune_graphdeco.kernels import ORDER, SPLAT, read_kernels
 from fragprune_graphdeco.reading import ACTIVATIONS, defaults, made_models, returns
 from fragprune_plugins.adapting import (
     Function,
@@ -322,7 +322,7 @@ def _of_kernel(repo: HostRepo) -> Iterator[str]:
         for node in nodes(repo.tree(module)):
             if isinstance(node, ast.ImportFrom) and any(RASTERIZER in a.name for a in node.names):
                 for finding in read_kernels(repo, repo.absolute(module, node), SPLAT):
-                    if finding.level == "error":
+                    if finding.level == "error" and finding.code != ORDER:
                         yield f"its rasterizer draws otherwise: {finding.found}, {finding.where}"
 
 
@@ -359,14 +359,22 @@ def _drawing(repo: HostRepo, module: str) -> list[ast.FunctionDef]:
     return sorted(found, key=lambda each: each.name != "render")
 
 
-def _call(function: ast.AST) -> ast.Call | None:
-    """The first call that draws."""
+def _call(function: ast.AST, off: Collection[str] = ()) -> ast.Call | None:
+    """The first call that draws, one that needs no argument that is off if there is any."""
+    needy = [node for node in nodes(function) if isinstance(node, ast.If) and _needs(node, off)]
+    behind = {id(inner) for node in needy for each in node.body for inner in nodes(each)}
     calls = [
         node
         for node in nodes(function)
         if isinstance(node, ast.Call) and any(each.arg == "means3D" for each in node.keywords)
     ]
-    return min(calls, key=lambda each: each.lineno, default=None)
+    return min(calls, key=lambda each: (id(each) in behind, each.lineno), default=None)
+
+
+def _needs(node: ast.If, off: Collection[str]) -> bool:
+    """Whether a branch is taken only if one of these arguments is given."""
+    test = ast.unparse(node.test)
+    return any(re.fullmatch(rf"{each}( is not None)?", test) for each in off)
 
 
 class Drawing:
@@ -401,7 +409,7 @@ class Drawing:
             and isinstance(node.value, ast.Name)
         ]
         self.model = models[0] if models else "pc"
-        self.call = _call(function)
+        self.call = _call(function, self.off)
         self.colours = set[str]()
         named = (*self.parameters, self.model)
         self.made: dict[str, tuple[str, ...]] = {each: (each,) for each in named}
@@ -417,9 +425,7 @@ class Drawing:
             before = self.made
             if isinstance(node, ast.If):
                 test = ast.unparse(node.test)
-                on = self._is_colour_option(node) or any(
-                    re.fullmatch(rf"{each}( is not None)?", test) for each in self.off
-                )
+                on = self._is_colour_option(node) or _needs(node, self.off)
                 none = any(re.fullmatch(rf"{each} is None|not {each}", test) for each in self.off)
                 self._collect([] if on else node.body)
                 if not none:
@@ -470,7 +476,7 @@ class Drawing:
         """What an expression is made of: "model.x", parameters, and "model" itself."""
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
             if self.made.get(node.value.id) == (self.model,):
-                yield f"{self.model}.{node.attr}"
+                yield from (f"{self.model}.{each}" for each in self._given_by(node.attr))
                 return
             yield from self._roots(node.value)
         elif isinstance(node, ast.Name):
@@ -484,6 +490,15 @@ class Drawing:
                 part = child.value if isinstance(child, ast.keyword) else child
                 if isinstance(part, ast.expr):
                     yield from self._roots(part)
+
+    def _given_by(self, name: str) -> list[str]:
+        """The attributes of the model that an attribute gives: itself, or what its method does."""
+        method = self.repo.function("scene.gaussian_model", f"GaussianModel.{name}")
+        body = method.body[-1] if method and len(method.body) == 1 else None
+        value = body.value if isinstance(body, ast.Return) else None
+        given = value.elts if isinstance(value, ast.Tuple) else []
+        own = [each.attr for each in given if re.fullmatch(r"self\.\w+", ast.unparse(each))]  # type: ignore[attr-defined]
+        return own if own and len(own) == len(given) else [name]
 
     def selection(self) -> str:
         """The code that picks rows of what is drawn first, as ``means3D[mask]``; "" without any."""

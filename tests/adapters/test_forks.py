@@ -91,6 +91,33 @@ def test_every_value_is_in_its_place_with_its_gradient(scene, objects):
     torch.testing.assert_close(found, expected)
 
 
+@pytest.mark.parametrize("detached", ["objects", "depth", "alpha", "invdepth"])
+def test_a_value_that_moves_no_gaussian_is_drawn_all_the_same(scene, objects, detached):
+    roles = tuple(replace(each, detached=each.role == detached) for each in VALUES["p"])
+    dialect = replace(DIALECT, fork=replace(FORK, outputs={"p": roles}))
+    engine, call = create_engine("reference"), call_of(scene, objects.requires_grad_(True))
+
+    def answered(by):
+        drawn = by.answer(call, by.unpack(call), lambda each: engine.rasterize(each, None))
+        return dict(zip(ROLES, drawn, strict=True))
+
+    values, moving = answered(dialect), answered(DIALECT)
+    for name in ("objects", "depth", "alpha", "invdepth"):
+        torch.testing.assert_close(values[name], moving[name])
+        leaves = (scene.splats.means, objects) if name == "objects" else (scene.splats.means,)
+        found, expected = (gradients(each[name], leaves) for each in (values, moving))
+        if name == detached:
+            assert not found[0].any()
+            assert expected[0].any()
+        torch.testing.assert_close(found[1:], expected[1:])
+
+
+def gradients(value, leaves):
+    if not value.requires_grad:
+        return [torch.zeros_like(each) for each in leaves]
+    return list(torch.autograd.grad(value.sum(), leaves, retain_graph=True))
+
+
 READS = {
     "a sum": lambda value: value + 1,
     "a sum, turned round": lambda value: 1 + value,

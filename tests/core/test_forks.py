@@ -72,6 +72,41 @@ def test_a_value_that_is_read_needs_a_kernel_that_tells_what_it_is(tmp_path, val
     assert "whose meaning is unknown" in errors(scaled)[0]
 
 
+W, Z = "float w = alpha * T;", "const float z = depths[collected_id[j]];"
+STORED = "{} D += {}; out_depth[pix_id] = D;"
+SAME = {
+    "by other names": ("depth", STORED.format(W + Z, "w * z; a.w = 1")),
+    "half by another name": ("depth", STORED.format(Z, "z * alpha * T")),
+    "by a name of two values": (None, STORED.format(W + Z + "float w = alpha;", "w * z")),
+    "by a name that changes": (None, STORED.format(W + Z + "w *= 2;", "w * z")),
+    "beside another depth": ("depth", DEPTH + "out_median_depth[pix_id] = M;"),
+    "what light is left": ("alpha", "T = test_T; out_alpha[pix_id] = 1 - T;"),
+    "what light another left": (None, "T = test_T * x; out_alpha[pix_id] = 1 - T;"),
+}
+
+
+@pytest.mark.parametrize("what", SAME)
+def test_a_sum_is_known_in_any_spelling(tmp_path, what):
+    role, kernel = SAME[what]
+    value = "rendered_alpha" if "out_alpha" in kernel else "rendered_depth"
+    used = (USED[0], USED[1].format(value))
+    repo = fork(tmp_path, used, values=f"image, radii, {value}", kernel=kernel)
+    if role is None:
+        assert "whose meaning is unknown" in errors(repo)[0]
+        return
+    assert errors(repo) == []
+    assert read_fork(repo).outputs["diff_gaussian_rasterization"][2].role == role
+
+
+def test_gaussians_in_another_order_are_another_picture_of_a_plain_ply(tmp_path):
+    assert errors(fork(tmp_path / "z", kernel="depths[idx] = p_view.z;")) == []
+    repo = fork(tmp_path / "distance", kernel="depths[idx] = length(p_view);")
+    assert "Gaussians sorted by length(p_view)" in errors(repo)[0]
+    plugins = load_plugins()
+    verdict = judge(repo, attempt(repo, plugins.adapters), plugins.adapters, plugins)
+    assert verdict.kind == "finetune"
+
+
 def test_a_value_that_no_proof_can_tell_is_refused(tmp_path):
     used = (USED[0], USED[1].format("median_depth"))
     repo = fork(tmp_path, used, values="image, radii, median_depth")
@@ -92,6 +127,43 @@ def test_blended_channels_are_known_by_argument_and_kernel(tmp_path, name):
     passed = {"values": values, "arguments": f", {name}=objects", "kernel": OBJECTS}
     empty = fork(tmp_path / "empty", used, ("    rasterizer =", made), **passed)
     assert "objects, which is empty unless asked for" in errors(empty)[0]
+
+
+PULL = "dL_dalpha += ({} - accum_{}[ch]) * dL_{};"
+BACKWARD = {
+    "both": (PULL.format("c", "rec", "dchannel") + PULL.format("f", "rec_F", "dF"), False),
+    "colours alone": (
+        PULL.format("c", "rec", "dchannel") + "// " + PULL.format("f", "F", "F"),
+        True,
+    ),
+    "neither": ("dL_dalpha += all;", None),
+}
+
+
+@pytest.mark.parametrize("what", BACKWARD)
+def test_the_backward_pass_says_whether_channels_move_gaussians(tmp_path, what):
+    used, (text, detached) = (USED[0], USED[1].format("objects")), BACKWARD[what]
+    given = {"arguments": ", sh_objs=pc.get_objects", "kernel": OBJECTS}
+    fork(tmp_path, used, values="image, radii, objects", **given)
+    (tmp_path / "submodules/a/backward.cu").write_text(text)
+    repo = HostRepo(tmp_path)
+    if detached is None:
+        assert "objects, read in train.py" in errors(repo)[0]
+        return
+    assert errors(repo) == []
+    assert read_fork(repo).outputs["diff_gaussian_rasterization"][2].detached is detached
+
+
+OF_DEPTH = "dL_dalpha += (z - accum_depth) * dL_ddepth;"
+
+
+@pytest.mark.parametrize("further", [OF_DEPTH, ""], ids=["moves", "moves nothing"])
+def test_the_backward_pass_says_whether_a_depth_moves_gaussians(tmp_path, further):
+    fork(tmp_path, (USED[0], USED[1].format("depth")), values="image, radii, depth", kernel=DEPTH)
+    text = PULL.format("c", "rec", "dchannel") + further
+    (tmp_path / "submodules/a/backward.cu").write_text(text)
+    (*_, depth) = read_fork(HostRepo(tmp_path)).outputs["diff_gaussian_rasterization"]
+    assert (depth.role, depth.detached) == ("depth", not further)
 
 
 DRAWN = "if (test_T < 0.0001f) { done = true; continue; }"

@@ -82,6 +82,27 @@ CLAMPED = """rotations=rotations
 """
 
 
+BOXED = """
+    if training:
+        boxed, shades = pc.get_xyz[pc.box], pc.get_features[pc.box]
+        image, radii, depth, used = rasterizer(
+            means3D=boxed, opacities=faint, shs=shades, colors_precomp=lit
+        )
+        return {"render": image}
+    means3D = pc.get_xyz
+"""
+
+
+SHAPES = """    def get_shapes(self):
+        return {}, self.get_scaling
+
+    def save_ply"""
+SHAPED = """
+    shapes = pc.get_shapes()
+    opacity, _ = shapes
+"""
+
+
 @pytest.fixture
 def fork(tmp_path):
     """A fork whose PLY is plain 3DGS and that no adapter fits; replaces text in its files."""
@@ -226,11 +247,22 @@ def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):
             "class GaussianModel:",
             f"class GaussianModel2D:{GROWS}(self): ...\n\n\nclass GaussianModel:",
         ),
+        ("\n    means3D = pc.get_xyz\n", BOXED),
         (".repeat(1, 3)", "\n        scales = scales if self.round else scales.repeat(1, 3)"),
     ],
 )
 def test_what_leaves_the_picture_alone_is_plain(fork, old, new):
     assert read_plain(fork((old, new)))
+
+
+@pytest.mark.parametrize("value", ["self.get_opacity", "self.get_opacity * self.rain"])
+def test_a_method_that_gives_getters_alone_is_plain(fork, value):
+    changes = (
+        ("    def save_ply", SHAPES.format(value)),
+        ("\n    opacity = pc.get_opacity\n", SHAPED),
+    )
+    reasons = read_plain(fork(*changes)).reasons
+    assert ("makes opacities from pc.get_shapes" in str(reasons)) == ("rain" in value)
 
 
 def test_what_is_never_saved_or_drawn_is_not_plain(fork, tmp_path):

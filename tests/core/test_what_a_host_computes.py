@@ -55,9 +55,22 @@ def errors(repo, adapter=Vanilla3DGS):
     return [str(f) for f in adapter().match(repo).findings if f.level == "error"]
 
 
-def test_a_vendored_rasterizer_that_draws_by_the_known_rule_fits(tmp_path):
-    vendor(tmp_path)
+NORMAL = EWA.replace("0, 0, 0);", "p.x / l, p.y / l, p.z / l);")
+
+
+@pytest.mark.parametrize("projection", [EWA, NORMAL], ids=["flat", "with the axis of depth"])
+def test_a_vendored_rasterizer_that_draws_by_the_known_rule_fits(tmp_path, projection):
+    vendor(tmp_path, projection)
     assert not errors(skeleton(tmp_path))
+
+
+def test_gaussians_in_another_order_are_another_picture(tmp_path):
+    repo = skeleton(tmp_path)
+    known, other = "depths[idx] = p_view.z;", "depths[idx] = sqrt(norm(p_view));"
+    vendor(tmp_path, widened=f"{WIDENED} {known}")
+    assert not errors(repo)
+    vendor(tmp_path, widened=f"{WIDENED} {other}", folder="b")
+    assert "Gaussians sorted by sqrt(norm(p_view))" in errors(HostRepo(tmp_path))[0]
 
 
 @pytest.mark.parametrize(
