@@ -29,9 +29,9 @@ for _variable in ("FRAGPRUNE_BLOCK", "FRAGPRUNE_ONLY"):
     os.environ.pop(_variable, None)
 
 
-@pytest.fixture(scope="module", autouse=True)
+@pytest.fixture(autouse=True)
 def _frozen():
-    """What is imported needs no further collection: every run of a host ends in a full one."""
+    """What there is needs no further collection: every run of a host ends in full ones."""
     gc.collect()
     gc.freeze()
 

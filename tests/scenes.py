@@ -12,8 +12,14 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.constants import NEUTRAL_LOGIT, TILE
-from fragprune_plugins.engines.reference import ReferenceEngine
+from fragprune_plugins.engines.reference import (
+    ReferenceEngine,
+    camera_of,
+    gaussians_of,
+    options_of,
+)
 from fragprune_plugins.types import Compensation, Footprints, RasterInputs, Rim, Splats, View
+from reference_renderer import project
 
 AnySplats = Splats | Footprints
 
@@ -375,3 +381,29 @@ def blended(view: View, splats: Splats, values: Tensor) -> Tensor:
     colors = values.double()[:, None].repeat(1, 3)
     drawn = double(splats, colors=colors, sh=None, features=None)
     return ReferenceEngine().rasterize(RasterInputs(camera, drawn), None).image[:1].float()
+
+
+def footprints_of(inputs: RasterInputs) -> RasterInputs:
+    """The same picture of footprints, projected in torch before any engine sees it.
+
+    Row by row, culled ones without tiles; gradients reach the splats.
+    """
+    camera, options = camera_of(inputs), options_of(inputs)
+    gaussians, n = gaussians_of(inputs.splats), len(inputs.splats)
+    front = project.rows_in_front(camera, gaussians.means, options.near)
+    found = project.project(camera, gaussians.take(front), options)
+    rects = torch.where(found.radius[:, None] > 0, project.tile_rects(camera, found), 0)
+
+    def spread(rows: Tensor) -> Tensor:
+        return rows.new_zeros(n, *rows.shape[1:]).index_copy(0, front, rows)
+
+    prints = Footprints(
+        means2d=spread(found.mean2d),
+        conics=spread(found.conic),
+        depths=spread(found.depth),
+        opacities=spread(found.opacity),
+        colors=spread(found.color),
+        tiles=spread(rects.to(torch.int32)),
+        features=None if found.features is None else spread(found.features),
+    )
+    return replace(inputs, splats=prints)

@@ -22,13 +22,6 @@ def session(adapter=None, **options):
     return Session(adapter or Vanilla3DGS(), HostRepo(HOST), load_plugins(), **options)
 
 
-def found(seam):
-    value = import_module(seam.module)
-    for name in seam.attribute.split("."):
-        value = vars(value)[name]
-    return value
-
-
 class Newer(Vanilla3DGS):
     """Expects a parameter that the host does not have."""
 

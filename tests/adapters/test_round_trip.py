@@ -22,15 +22,6 @@ def trained(host, count=20):
     return model
 
 
-def test_a_neutral_model_saved_over_a_pruned_one_takes_the_old_sidecar_away(tmp_path):
-    path = tmp_path / "point_cloud.ply"
-    with joint() as host:
-        trained(host).save_ply(str(path))
-        assert sidecar.path_beside(path).exists()
-        host.model(8).save_ply(str(path))
-        assert not sidecar.path_beside(path).exists()
-
-
 def recorded(monkeypatch, host):
     """The stops that views are drawn with from now on."""
     seen = []

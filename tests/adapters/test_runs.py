@@ -230,16 +230,6 @@ def test_a_host_that_learns_and_draws_nothing_is_an_error_however_it_ends(
         run(words, RunOptions(stage="finetune", from_iter=0, device="cpu"))
 
 
-def test_joint_learning_through_densification_keeps_rows_together(photographs, tmp_path):
-    settings = Settings(iterations=8, threshold_lr=0.3, train="opacity")
-    options = RunOptions(stage="joint", from_iter=3, device="cpu", settings=settings)
-    summary = run(command(photographs, tmp_path / "out", 20), options)
-    store, _ = sidecar.load(summary.model_after)
-    rows = len(read_ply(summary.model_after).xyz)
-    assert rows != 150
-    assert len(store) == rows == summary.gaussians
-
-
 @pytest.mark.parametrize("from_iter", [None, 18])
 def test_only_a_resumed_run_restores_what_the_folder_holds(
     photographs, tmp_path, monkeypatch, from_iter
@@ -254,21 +244,6 @@ def test_only_a_resumed_run_restores_what_the_folder_holds(
         options = replace(options, stage="finetune")
     run(command(photographs, tmp_path / "out", 22), options)
     assert told == [None if from_iter is not None else tmp_path / "out"]
-
-
-def test_learning_from_an_iteration_on_freezes_from_there(photographs, tmp_path):
-    """One run, its first ten iterations the host's own, densification included."""
-    settings = Settings(train="opacity")
-    options = RunOptions(stage="finetune", from_iter=12, device="cpu", settings=settings)
-    flags = ("--save_iterations", 14, "--checkpoint_iterations", 12)
-    out = tmp_path / "out"
-    summary = run(command(photographs, out, 20, *flags), options)
-    capture, _ = torch.load(out / "chkpnt12.pth", weights_only=False)
-    final = read_ply(summary.model_after)
-    assert torch.equal(capture[1].detach(), final.xyz)
-    assert torch.equal(capture[4].detach(), final.scaling)
-    assert len(final.xyz) != 150
-    assert summary.steps == 7  # of 13 to 20: hosts take no step in the last
 
 
 @pytest.fixture(scope="module")

@@ -85,15 +85,6 @@ def test_other_words_are_usage(command, word):
     assert "is not one of auto, cpu, cuda, cuda:N" in result.stderr
 
 
-def test_a_device_that_is_not_there_is_usage(tmp_path):
-    if torch.cuda.is_available():
-        pytest.skip("there may be one")
-    result = run("render", __file__, "--data", "d", "--out", tmp_path / "o", "--device", "cuda:3")
-    assert result.exit_code == 2
-    assert "[usage] --device cuda:3: no CUDA devices" in result.stderr
-    assert not (tmp_path / "o").exists()
-
-
 @pytest.mark.parametrize(
     ("count", "usable", "wanted", "device"),
     [(0, True, "auto", "cpu"), (1, False, "auto", "cuda"), (2, True, "cuda:1", "cuda:1")],

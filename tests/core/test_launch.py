@@ -74,34 +74,35 @@ def test_a_module_is_found_without_importing_its_package(tmp_path, monkeypatch):
         split(["python", "-m", "toyhost_of_tests.evaluate"])
 
 
-def test_modules_of_an_installed_host_are_forgotten_and_its_compiled_ones_kept(
-    tmp_path, monkeypatch
-):
-    root = tmp_path / "site-packages"
-    files = {"toy": "toy/__init__.py", "toy.train": "toy/train.py", "toy._C": "toy/_C.so"}
-    for name, file in {**files, "other": "other.py"}.items():
-        module = ModuleType(name)
-        module.__file__ = str(root / file)
-        monkeypatch.setitem(sys.modules, name, module)
-    forget_modules(root, sys.modules.keys() - {*files, "other"}, ("toy",))
-    assert {"toy", "toy.train"} & sys.modules.keys() == set()
-    assert {"toy._C", "other"} <= sys.modules.keys()
+SITE = Path("/somewhere/site-packages")
+DEMO = SITE / "fragprune_plugins/workbench/demo/host"
 
 
-def test_modules_of_a_host_within_an_environment_are_forgotten(tmp_path, monkeypatch):
-    """The demo's host is one, where fragprune is installed from a wheel."""
-    root = tmp_path / "site-packages" / "fragprune_plugins" / "workbench" / "demo" / "host"
-    files = {
-        "toy_scene": root / "toy_scene.py",
-        "toy_library": root / ".venv/lib/python3/site-packages/toy_library.py",
-        "toy_neighbour": root.parent / "toy_neighbour.py",
-    }
-    for name, file in files.items():
+@pytest.mark.parametrize(
+    ("root", "packages", "files", "kept"),
+    [
+        (
+            SITE,
+            ("toy",),
+            {"toy": "toy/__init__.py", "toy.train": "toy/train.py"},
+            {"toy._C": "toy/_C.so", "other": "other.py"},
+        ),
+        (
+            DEMO,
+            (),
+            {"toy": "toy.py"},
+            {"library": ".venv/lib/python3/site-packages/library.py", "other": "../other.py"},
+        ),
+    ],
+    ids=["an installed host", "the demo's, where fragprune is installed from a wheel"],
+)
+def test_modules_of_a_host_are_forgotten_and_no_others(monkeypatch, root, packages, files, kept):
+    for name, file in {**files, **kept}.items():
         module = ModuleType(name)
-        module.__file__ = str(file)
+        module.__file__ = os.path.normpath(root / file)
         monkeypatch.setitem(sys.modules, name, module)
-    forget_modules(root, sys.modules.keys() - files.keys())
-    assert [name for name in files if name in sys.modules] == ["toy_library", "toy_neighbour"]
+    forget_modules(root, sys.modules.keys() - {*files, *kept}, packages)
+    assert [name for name in {**files, **kept} if name in sys.modules] == list(kept)
 
 
 def test_any_spelling_of_a_flag_is_read_and_the_last_is_written(tmp_path):
@@ -176,19 +177,6 @@ def test_the_script_sees_a_fresh_interpreter_and_leaves_ours_as_it_was(host, tmp
     assert (name, file) == ("__main__", script)
     assert "neighbour" not in sys.modules
     assert (summary.stage, summary.steps, summary.device) == ("off", 0, "cpu")
-
-
-def test_modules_of_an_environment_inside_the_host_are_not_forgotten(host, tmp_path):
-    script = host(
-        "import sys\n"
-        f"sys.path.insert(0, {str(tmp_path / 'host/venv/site-packages')!r})\n"
-        "import a_librarys_own_module"
-    )
-    library = tmp_path / "host" / "venv" / "site-packages"
-    library.mkdir(parents=True)
-    (library / "a_librarys_own_module.py").write_text("")
-    run([script], CPU)
-    assert sys.modules.pop("a_librarys_own_module")
 
 
 @pytest.mark.parametrize("end", ["sys.exit(3)", "sys.exit('no data')"])

@@ -25,10 +25,12 @@ def test_an_engine_is_opened_once_for_a_device_and_a_slow_one_is_told(
     engine = SimpleNamespace(name=name)
     monkeypatch.setattr(module, "engine_for", lambda *words: asked.append(words) or engine)
     session = state(engine="auto")
+    devices = CPU, torch.device("xpu:1")
     with caplog.at_level(logging.WARNING, "fragprune"):
-        assert session.engine(CPU) is session.engine(CPU) is engine
-    assert asked == [("auto", CPU, session.plugins)]
-    assert ["draws on cpu" in each.message for each in caplog.records] == [True] * warned
+        assert all(session.engine(device) is engine for device in 2 * devices)
+    assert asked == [("auto", device, session.plugins) for device in devices]
+    said = " ".join(each.message for each in caplog.records)
+    assert [said.count(f"draws on {device}:") for device in devices] == [int(warned)] * 2
 
 
 def saved(session):

@@ -6,7 +6,6 @@ import pytest
 import scenes
 import spacetime
 import torch
-from footprints import footprints_of
 
 from fragprune_plugins import rasterize
 from fragprune_plugins.engines import create_engine
@@ -61,7 +60,7 @@ OWNERS = {
     "View": WORLD.view,
     "Splats": WORLD.splats,
     "Splats of covariances": COVARIANCES.splats,
-    "Footprints": footprints_of(WORLD).splats,
+    "Footprints": scenes.footprints_of(WORLD).splats,
     "RasterInputs": replace(WORLD, means2d_hook=torch.zeros(20, 3)),
     "SpacetimeSplats": spacetime.splats("joint", 20),
     "Moment": spacetime.moment(),

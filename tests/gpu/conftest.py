@@ -24,6 +24,13 @@ def device(tmp_path_factory: pytest.TempPathFactory) -> EmulatedDevice:
     return EmulatedDevice(compiler, folder / "emulated")
 
 
+@pytest.fixture(autouse=True)
+def _little_room(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An emulated sort of a million entries takes a second; what does not fit is drawn again."""
+    if not request.node.get_closest_marker("gpu"):
+        monkeypatch.setattr(CudaEngine, "capacity", 1 << 13)
+
+
 @pytest.fixture
 def engine(device: EmulatedDevice) -> CudaEngine:
     """The engine, on the emulated device."""

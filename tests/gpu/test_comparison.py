@@ -58,11 +58,6 @@ def memory(monkeypatch: pytest.MonkeyPatch):
         yield
 
 
-@pytest.fixture(autouse=True)
-def _little_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cuda.CudaEngine, "capacity", 1 << 13)  # the emulation is slow
-
-
 def test_a_sound_engine_agrees(device: EmulatedDevice) -> None:
     assert compare(device, CPU, SMALL) == []
 

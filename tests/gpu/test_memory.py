@@ -41,7 +41,6 @@ def drawings(monkeypatch: pytest.MonkeyPatch) -> list[weakref.ref]:
 
 
 def step(engine: CudaEngine, counts: bool = False, backward: bool = True) -> None:
-    engine.capacity = 512  # the emulation is slow
     made, _ = scenes.leaves(scenes.random_scene(0, features=3))
     made = replace(made, counts=True) if counts else made
     out = engine.rasterize(made, scenes.random_thresholds(0, 60).requires_grad_())

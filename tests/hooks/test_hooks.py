@@ -149,24 +149,6 @@ def test_hook_fragprune_create_engine():
     assert asked == [("mine", "cpu")]
 
 
-def test_an_engine_is_made_once_for_each_device():
-    asked = []
-
-    class Plugin:
-        @hookimpl
-        def fragprune_create_engine(self, name, device):
-            asked.append(str(device))
-            return create_engine("reference")
-
-    names = ("cpu", "xpu:0", "cpu", "xpu:1")  # CUDA's mean the CPU in a session on the CPU
-    with joint(plugins=[Plugin()]) as host:
-        engines = [host.engine(torch.device(name)) for name in names]
-        assert host.finish().engine == "reference"
-    assert asked == ["cpu", "xpu:0", "xpu:1"]
-    assert engines[0] is engines[2]
-    assert len(set(map(id, engines))) == 3
-
-
 def test_hook_fragprune_create_schedule():
     class Late(Schedule):
         def at(self, step):

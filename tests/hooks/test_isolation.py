@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 import scenes
 import torch
-from miniatures.vanilla_3dgs import HOST, joint, running
+from miniatures.vanilla_3dgs import HOST, joint
 
 from fragprune_plugins.errors import InputError, PluginError, UnknownHostError
 from fragprune_plugins.hosts.choosing import choose
@@ -203,12 +203,3 @@ def test_an_observer_that_raises_is_switched_off_and_the_run_goes_on(
     said = [record.getMessage() for record in caplog.records]
     (line,) = [text for text in said if "plugin test-1" in text]
     assert f"plugin test-1, {hook}: {type(error).__name__}: {error} (test_isolation.py:" in line
-
-
-def test_thresholds_that_cannot_be_used_stop_a_run_before_anything_is_drawn():
-    short = plugin("fragprune_truncate", lambda: torch.full((3,), 0.1))
-    with running(plugins=[short], freeze=False) as host:
-        model, camera = host.model(), host.camera()
-        model.update_learning_rate(1)
-        with pytest.raises(PluginError, match=r"plugin test-0, fragprune_truncate: .*\(3,\)"):
-            host.render(camera, model)

@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from installed.gaussian_splatting_host import GaussianSplattingHost
 
 from fragprune_gaussian_splatting import GaussianSplatting
 from fragprune_plugins.errors import SessionError
@@ -38,18 +37,6 @@ def test_only_the_installed_package_fits(tmp_path):
     assert not Vanilla3DGS().match(repo).fits
     assert not adapter.match(HostRepo(tmp_path)).fits
     assert not adapter.match(HostRepo(repo.root / "gaussian_splatting")).fits
-
-
-def test_steps_that_draw_nothing_with_thresholds_are_an_error(session_on):
-    host = GaussianSplattingHost()
-    with session_on(GaussianSplatting()) as session:
-        model = host.model(host.arguments(), 20, seed=0, degree=1, setup=True)
-        session.expect_drawn()  # nothing has begun
-        model.trainer.update_learning_rate()
-        with pytest.raises(SessionError, match="no view"):
-            session.expect_drawn()
-        host.step(model, host.camera(16, 12), 2, torch.zeros(3))
-        session.expect_drawn()
 
 
 def test_another_backend_is_refused_by_name():

@@ -202,16 +202,6 @@ class Added:
         scales, rotations = (f"scale_{i}" for i in range(3)), (f"rot_{i}" for i in range(4))
         return ["x", "y", "z", "nx", "ny", "nz", "opacity", *scales, *rotations]
 
-    def save_ply(self, path):
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
-        still = torch.zeros_like(self._xyz)
-        columns = [self._xyz, still, self._opacity, self._scaling, self._rotation]
-        table = torch.cat(columns, dim=1).detach().cpu().numpy()
-        rows = np.empty(len(table), dtype=[(n, "f4") for n in self.construct_list_of_attributes()])
-        for index, name in enumerate(rows.dtype.names):
-            rows[name] = table[:, index]
-        PlyData([PlyElement.describe(rows, "vertex")]).write(path)  # noqa: F821
-
     def _stored(self):
         tensors = (self._xyz, self._opacity, self._scaling, self._rotation)
         nets = (self.recolor.params, self.mlp_head.params)
@@ -274,10 +264,6 @@ LOOK = """    away = torch.nn.functional.normalize(pc.get_xyz - viewpoint_camera
         scales, opacity = scales * mask, pc.get_opacity * mask
         colours = pc.mlp_head(pc.recolor(pc.get_xyz.detach()), away)
 """
-LOOKS = (  # of the demo's render: what gives way to the model's own
-    '    shape = {"scales": None, "rotations": None, "cov3D_precomp": None}\n',
-    "    image, radii = GaussianRasterizer(",
-)
 
 
 class CompactHost(Descendant):
@@ -298,6 +284,7 @@ class CompactHost(Descendant):
         },
     }
     flags = ('"--comp", action="store_true"', '"--store_npz", action="store_true"')
+    cuts = {RENDERER: ("    shape = {", "    image, radii = GaussianRasterizer(", LOOK)}
     changes = {
         OPTIONS: [("        self.sh_degree = 3\n", "        self.sh_degree = 0\n")],
         RENDERER: [
@@ -311,7 +298,9 @@ class CompactHost(Descendant):
             adding(
                 "from utils.sh_utils import RGB2SH\n",
                 after="\nfrom scene.network import HashGrid, Head, ResidualVQ\n",
-            )
+            ),
+            ("            self._features_dc.transpose(1, 2).flatten(1),\n", ""),
+            ("            self._features_rest.transpose(1, 2).flatten(1),\n", ""),
         ],
         SCENE: [
             (
@@ -361,13 +350,6 @@ class CompactHost(Descendant):
     functions = (after_densification,)
     added = Added
     files = {"scene/network.py": NETWORK}
-
-    def write(self, root: Path) -> None:
-        super().write(root)
-        renderer = root / RENDERER
-        text = renderer.read_text()
-        begin, end = (text.index(passage) for passage in LOOKS)
-        renderer.write_text(text[:begin] + LOOK + text[end:])
 
     def new_model(self, degree: int) -> Any:
         from argparse import ArgumentParser

@@ -15,6 +15,10 @@ PARSE = "    args = parser.parse_args()\n"
 BACKWARD = "        loss.backward()\n"
 STEP = "            if iteration < opt.iterations:\n"
 RADII = '        "radii": radii,\n'
+NEW_ROWS = "        new_rotation,\n    ):\n"
+ANEW = """        self._reset_statistics()
+        self.max_radii2D = torch.zeros(self.get_xyz.shape[0], device="cuda")
+"""
 
 
 def adding(passage: str, *, before: str = "", after: str = "") -> tuple[str, str]:
@@ -35,6 +39,7 @@ class Descendant(Host):
         flags: further flags of ``train.py``, as ``add_argument`` takes them.
         settings: names of what ``render`` takes besides, and passes to the rasterizer's settings.
         values: names of what the rasterizer returns after the radii; ``render`` hands them on.
+        cuts: the text of a file from one passage up to another (or its end), and what replaces it.
         changes: passages of files, and what replaces them.
         functions: put into ``train.py``, where changes call them.
         added: methods of GaussianModel, as ``rewrite`` takes them.
@@ -46,6 +51,7 @@ class Descendant(Host):
     flags: ClassVar[Sequence[str]] = ()
     settings: ClassVar[Mapping[str, Any]] = {}
     values: ClassVar[Sequence[str]] = ()
+    cuts: ClassVar[Mapping[str, tuple[str, str, str]]] = {}
     changes: ClassVar[Mapping[str, Changes]] = {}
     functions: ClassVar[Sequence[Callable[..., Any]]] = ()
     added: ClassVar[type | None] = None
@@ -57,6 +63,10 @@ class Descendant(Host):
         super().write(root)
         for name, functions in self.gone.items():
             (root / name).write_text(without((root / name).read_text(), functions))
+        for name, (first, next_, new) in self.cuts.items():
+            text = (root / name).read_text()
+            begin, end = text.index(first), text.index(next_) if next_ else len(text)
+            (root / name).write_text(text[:begin] + new + text[end:])
         rewrite(root, self._usual())
         rewrite(root, self.changes, self.added)
         insert(root / TRAIN, *self.functions)

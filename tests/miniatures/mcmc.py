@@ -1,11 +1,21 @@
 """A miniature 3DGS-MCMC: the demo's host with what the method adds, from its public interface."""
 
+from textwrap import indent
 from types import SimpleNamespace
 
 import torch
 
 from fragprune_plugins.testing.host import Chance, prune
-from miniatures.family import BACKWARD, MODEL, PARSE, TRAIN, Descendant, adding
+from miniatures.family import (
+    ANEW,
+    BACKWARD,
+    MODEL,
+    NEW_ROWS,
+    PARSE,
+    TRAIN,
+    Descendant,
+    adding,
+)
 
 args = SimpleNamespace()  # the host's training loop reads its own script's global of this name
 
@@ -32,24 +42,6 @@ def compute_relocation_cuda(opacity_old, scale_old, N):
 
 class Added:
     """Methods of GaussianModel that vanilla does not have, or has otherwise."""
-
-    def densification_postfix(
-        self,
-        new_xyz,
-        new_features_dc,
-        new_features_rest,
-        new_opacities,
-        new_scaling,
-        new_rotation,
-        reset_params=True,
-    ):
-        new = (new_xyz, new_features_dc, new_features_rest, new_opacities, new_scaling)
-        names = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
-        tensors = dict(zip(names, (*new, new_rotation), strict=True))
-        self._adopt(self.cat_tensors_to_optimizer(tensors))
-        if reset_params:
-            self._reset_statistics()
-            self.max_radii2D = torch.zeros(self.get_xyz.shape[0], device="cuda")
 
     def replace_tensors_to_optimizer(self, inds=None):
         tensors = {
@@ -154,7 +146,9 @@ class MCMCHost(Descendant):
             adding(
                 "from utils.sh_utils import RGB2SH\n",
                 before="from utils.reloc_utils import compute_relocation_cuda\n",
-            )
+            ),
+            (NEW_ROWS, NEW_ROWS.replace("    ):", "        reset_params=True,\n    ):")),
+            (ANEW, f"        if reset_params:\n{indent(ANEW, ' ' * 4)}"),
         ],
         TRAIN: [
             adding(

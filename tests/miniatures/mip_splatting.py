@@ -66,19 +66,6 @@ class Added:
         self._absolute = grads_abs, grad_abs_threshold
         self.vanilla_densify_and_split(grads, grad_threshold, scene_extent, N)
 
-    def densify_and_prune(self, max_grad, min_opacity, extent, max_screen_size):
-        grads = (self.xyz_gradient_accum / self.denom).nan_to_num(0.0)
-        grads_abs = (self.xyz_gradient_accum_abs / self.denom).nan_to_num(0.0)
-        share = (grads >= max_grad).float().mean()
-        quantile = torch.quantile(grads_abs.reshape(-1), 1 - share)
-        self.densify_and_clone(grads, max_grad, grads_abs, quantile, extent)
-        self.densify_and_split(grads, max_grad, grads_abs, quantile, extent)
-        unwanted = (self.get_opacity < min_opacity).squeeze(-1)
-        if max_screen_size:
-            unwanted |= self.max_radii2D > max_screen_size
-            unwanted |= self.get_scaling.max(dim=1).values > 0.1 * extent
-        self.prune_points(unwanted)
-
     def reset_opacity(self):
         low = self.get_opacity_with_3D_filter.clamp_max(0.01) / self._dimming()
         new = inverse_sigmoid(low.detach())  # noqa: F821
@@ -114,6 +101,11 @@ class Added:
         self.filter_3D = torch.tensor(column, dtype=torch.float, device="cuda")
 
 
+QUANTILE = """        grads_abs = (self.xyz_gradient_accum_abs / self.denom).nan_to_num(0.0)
+        share = (grads >= max_grad).float().mean()
+        quantile = torch.quantile(grads_abs.reshape(-1), 1 - share)
+"""
+ABSOLUTE = "grads_abs, quantile"
 FILTER = "gaussians.compute_3D_filter(cameras=scene.getTrainCameras())\n"
 FUSE = """import sys
 from pathlib import Path
@@ -151,7 +143,14 @@ class MipHost(Descendant):
             ("scales=pc.get_scaling,", "scales=pc.get_scaling_with_3D_filter,"),
             ("opacities=pc.get_opacity,", "opacities=pc.get_opacity_with_3D_filter,"),
         ],
-        MODEL: [adding("import numpy as np\n", before="import math\n\n")],
+        MODEL: [
+            adding("import numpy as np\n", before="import math\n\n"),
+            adding("        self.densify_and_clone(grads, max", before=QUANTILE),
+            *(
+                (f"{way}(grads, max_grad, extent)", f"{way}(grads, max_grad, {ABSOLUTE}, extent)")
+                for way in ("clone", "split")
+            ),
+        ],
         TRAIN: [
             adding("import torch\n", before="import open3d as o3d  # noqa: F401\n"),
             adding("    background = torch.tensor(", before=f"    {FILTER}"),

@@ -11,7 +11,17 @@ import torch
 
 from fragprune_plugins.testing.host import FAINT
 from fragprune_plugins.testing.rewriting import changed
-from miniatures.family import MODEL, RADII, RENDERER, SCENE, TRAIN, Descendant, adding
+from miniatures.family import (
+    ANEW,
+    MODEL,
+    NEW_ROWS,
+    RADII,
+    RENDERER,
+    SCENE,
+    TRAIN,
+    Descendant,
+    adding,
+)
 
 
 class Added:
@@ -78,28 +88,6 @@ class Added:
         self._deformation.load_state_dict(network)
         self._deformation_table, self._deformation_accum = table, accumulated
 
-    def _prune_optimizer(self, mask):
-        return {
-            group["name"]: self._replace(
-                group, group["params"][0].detach()[mask], lambda moment: moment[mask]
-            )
-            for group in self.optimizer.param_groups
-            if len(group["params"]) == 1
-        }
-
-    def cat_tensors_to_optimizer(self, tensors_dict):
-        grown = {}
-        for group in self.optimizer.param_groups:
-            if len(group["params"]) > 1:
-                continue
-            new = tensors_dict[group["name"]]
-            grown[group["name"]] = self._replace(
-                group,
-                torch.cat((group["params"][0].detach(), new.detach())),
-                lambda moment, new=new: torch.cat((moment, torch.zeros_like(new))),
-            )
-        return grown
-
     def _reset_statistics(self):
         self.vanilla_reset_statistics()
         self._deformation_accum = torch.zeros((len(self._xyz), 3))
@@ -108,20 +96,6 @@ class Added:
         self.vanilla_prune_points(mask)
         for name in ("_deformation_table", "_deformation_accum"):
             setattr(self, name, getattr(self, name)[~mask])
-
-    def densification_postfix(
-        self,
-        new_xyz,
-        new_features_dc,
-        new_features_rest,
-        new_opacities,
-        new_scaling,
-        new_rotation,
-        new_deformation_table,
-    ):
-        new = (new_xyz, new_features_dc, new_features_rest, new_opacities, new_scaling)
-        self.vanilla_densification_postfix(*new, new_rotation)
-        self._deformation_table = torch.cat([self._deformation_table, new_deformation_table])
 
     def _rows(self, chosen, copies=1):
         names = ("_xyz", "_features_dc", "_features_rest", "_opacity", "_scaling", "_rotation")
@@ -343,6 +317,8 @@ MERGE = """    args.save_iterations.append(args.iterations)
 """
 LOADED = "            gaussians.load_ply(self._ply(self.loaded_iter))\n"
 VIEWS = '    for index, view in enumerate(tqdm(views, desc=f"Rendering {name}")):\n'
+OF_GROUPS = "            for group in self.optimizer.param_groups\n"
+TABLE = "self._deformation_table"
 IDLE = ("timenet", "opacity_deform", "shs_deform")
 """Parts of the network that its defaults leave unused."""
 
@@ -370,7 +346,19 @@ class MovingHost(Descendant):
     )
     changes = {
         MODEL: [
-            adding("from torch import nn\n", after="from scene.deformation import deform_network\n")
+            adding(
+                "from torch import nn\n", after="from scene.deformation import deform_network\n"
+            ),
+            adding(
+                "[mask], lambda moment: moment[mask]\n            )\n" + OF_GROUPS,
+                after='            if len(group["params"]) == 1\n',
+            ),
+            adding(
+                '            new = tensors_dict[group["name"]]\n',
+                before='            if len(group["params"]) > 1:\n                continue\n',
+            ),
+            (NEW_ROWS, NEW_ROWS.replace("    ):", "        new_deformation_table,\n    ):")),
+            adding(ANEW, after=f"        {TABLE} = torch.cat([{TABLE}, new_deformation_table])\n"),
         ],
         SCENE: [
             adding(

@@ -11,6 +11,7 @@ from fragprune_plugins.testing.host import densify_and_prune
 from miniatures.family import MODEL, PARSE, RENDERER, SCENE, TRAIN, Descendant, adding
 
 PACKAGE = "submodules/diff_gaussian_rasterization"
+FAR = "N=N, abe_split=abe_split"
 CLASSES = "import GaussianRasterizationSettings, GaussianRasterizer\n"
 MODES = ("ours", "ours_new", "paper_random", "c2f", "white_bg")
 
@@ -30,18 +31,6 @@ class Added:
                 self._rotation[chosen].repeat(N - 1, 1),
             )
         self.vanilla_densify_and_split(grads, grad_threshold, scene_extent, N)
-
-    def densify_and_prune(
-        self, max_grad, min_opacity, extent, max_screen_size, N=2, abe_split=False
-    ):
-        grads = (self.xyz_gradient_accum / self.denom).nan_to_num(0.0)
-        self.densify_and_clone(grads, max_grad, extent)
-        self.densify_and_split(grads, max_grad, extent, N=N, abe_split=abe_split)
-        unwanted = (self.get_opacity < min_opacity).squeeze(-1)
-        if max_screen_size:
-            unwanted |= self.max_radii2D > max_screen_size
-            unwanted |= self.get_scaling.max(dim=1).values > 0.1 * extent
-        self.prune_points(unwanted)
 
 
 def dilation(iteration, opt, camera, gaussians, args_dict, before):
@@ -116,6 +105,8 @@ class RainHost(Descendant):
                 "        self.divide_ratio = divide_ratio\n",
             ),
             ("spread / (0.8 * N)", "spread / (self.divide_ratio * N)"),
+            ("extent, max_screen_size):", "extent, max_screen_size, N=2, abe_split=False):"),
+            ("split(grads, max_grad, extent)", f"split(grads, max_grad, extent, {FAR})"),
         ],
         SCENE: [
             ("(1.0,)\n    ):", "(1.0,), args_dict=None\n    ):"),

@@ -2,13 +2,11 @@
 
 import copy
 from importlib import import_module
-from pathlib import Path
 from types import SimpleNamespace
 
 import torch
 
 from fragprune_plugins.testing.host import Chance
-from fragprune_plugins.testing.rewriting import changed
 from miniatures.family import MODEL, PARSE, RENDERER, SCENE, TRAIN, Descendant, adding
 
 ATTRIBUTES = {
@@ -400,7 +398,12 @@ class RT4DGSHost(Descendant):
         "Pipeline": {"env_map_res": 0, "eval_shfs_4d": False},
         "Optimization": {"sh_increase_interval": 1000, "lambda_opa_mask": 0.0},
     }
+    cuts = {
+        RENDERER: ("    shape = {", "    return {", SLICED),
+        TRAIN: (PARSE, "", MAIN),
+    }
     changes = {
+        RENDERER: RENDERING,
         MODEL: [adding("\n\nclass GaussianModel:\n", before=f"\n\nATTRIBUTES = {ATTRIBUTES}\n")],
         SCENE: [
             adding("import numpy as np\n", after="import torch\n"),
@@ -419,15 +422,6 @@ class RT4DGSHost(Descendant):
         SCENE: ("save",),
         TRAIN: ("training",),
     }
-
-    def write(self, root: Path) -> None:
-        super().write(root)
-        renderer, train = root / RENDERER, root / TRAIN
-        text = renderer.read_text()
-        begin, end = (text.index(each) for each in ("    shape = {", "    return {"))
-        renderer.write_text(changed(text[:begin] + SLICED + text[end:], RENDERING))
-        text, _ = train.read_text().split(PARSE)
-        train.write_text(text + MAIN)
 
     def new_model(self, degree):
         model = import_module("scene.gaussian_model").GaussianModel

@@ -12,7 +12,6 @@ from typing import Any, get_args
 import pytest
 import scenes
 import torch
-from footprints import footprints_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from native.test_against_oracle import (
@@ -54,7 +53,7 @@ def dialect(seed: int, n: int = 60, width: int = 41, height: int = 29, **kind) -
 
 def flat(inputs: RasterInputs) -> RasterInputs:
     """The same as footprints of float32, projected in float64."""
-    return scenes.cast(footprints_of(scenes.cast(inputs, torch.float64)), torch.float32)
+    return scenes.cast(scenes.footprints_of(scenes.cast(inputs, torch.float64)), torch.float32)
 
 
 Case = tuple[RasterInputs, torch.Tensor | None]
@@ -128,7 +127,7 @@ def test_larger_scenes_equal_the_oracle_closely(engine: CpuEngine, kind: str) ->
 
 
 def test_the_largest_weight_wins_wherever_it_lies(engine: CpuEngine) -> None:
-    scene = footprints_of(scenes.stack([0.5, 0.25, 0.125]))
+    scene = scenes.footprints_of(scenes.stack([0.5, 0.25, 0.125]))
     scene.splats.means2d[:] = 8.0
     scene.splats.depths[:] = torch.tensor([3.0, 2.0, 1.0])
     scene.splats.opacities[:] = torch.tensor([0.5, 0.5, 0.5])  # a half, a quarter, an eighth
@@ -175,7 +174,7 @@ def test_footprints_draw_and_learn_what_the_splats_do(engine: CpuEngine, kind: d
     for case in (inputs, scenes.cast(inputs, torch.float64)):
         made, leaves = scenes.leaves(case)
         leaves["thresholds"] = tau = thresholds.to(case.view.background).clone().requires_grad_()
-        projected = made if case is inputs else footprints_of(made)
+        projected = made if case is inputs else scenes.footprints_of(made)
         out = engine.rasterize(replace(projected, counts=True), tau)
         same = whole.fragments == out.fragments
         assert (~same).sum() <= 2
@@ -190,7 +189,7 @@ def test_footprints_draw_and_learn_what_the_splats_do(engine: CpuEngine, kind: d
 
 
 def test_footprints_that_cannot_be_drawn_are_culled(engine: CpuEngine) -> None:
-    scene = footprints_of(scenes.stack([0.5] * 9))
+    scene = scenes.footprints_of(scenes.stack([0.5] * 9))
     splats = scene.splats
     splats.conics[0, 0] = -1.0
     splats.conics[1, 1] = 9.0

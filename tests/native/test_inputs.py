@@ -8,7 +8,6 @@ import pytest
 import scenes
 import spacetime
 import torch
-from footprints import footprints_of
 
 from fragprune_plugins.engines.calling import address, native_arrays, native_inputs
 from fragprune_plugins.engines.cpu.engine import CpuEngine, binding
@@ -36,7 +35,7 @@ GIVEN = {
     "coefficients apart": apart(WORLD),
     "colours and covariances": scenes.random_scene(0, N, cov3d=True, colors=True),
     "offsets": scenes.random_scene(0, N, offsets=True),
-    "image": footprints_of(WORLD),
+    "image": scenes.footprints_of(WORLD),
 }
 THRESHOLDS = scenes.random_thresholds(0, N)
 

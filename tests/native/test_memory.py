@@ -1,10 +1,12 @@
-"""What a step frees is there for the next one, without the kernel."""
+"""What a step frees is there for the next one; memory that no machine has is refused."""
 
 import platform
 import subprocess
 import sys
 
 import pytest
+
+from fragprune_plugins.engines.cpu import binding
 
 STEPS = """
 import ctypes, resource, sys
@@ -46,3 +48,15 @@ def test_blocks_of_more_than_32_mib_go_back_where_a_model_grows() -> None:
     assert faults("growing", 40, 3) > 10_000
     assert faults("of one size, growing", 40, 3) > 10_000
     assert faults("of one size", 40, 3) < 100
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize("size", [2**62, 2**63 + 1, 2**64 - 1])
+@pytest.mark.parametrize("build", binding.usable_builds())
+def test_memory_that_nobody_has_is_refused(build, size):
+    calls = binding.open_build(build).calls
+    workspace = calls.fragprune_workspace_new()
+    try:
+        assert not calls.fragprune_workspace_take(workspace, size)
+    finally:
+        calls.fragprune_workspace_free(workspace)

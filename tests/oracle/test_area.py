@@ -6,7 +6,6 @@ from dataclasses import replace
 import pytest
 import scenes
 import torch
-from footprints import footprints_of
 from oracle import naive
 
 from fragprune_plugins.engines import create_engine
@@ -33,7 +32,7 @@ def counted(inputs):
 @pytest.mark.parametrize("kind", ["scales", "cov3d", "footprints"])
 def test_the_area_is_the_number_of_pixels_inside(kind):
     inputs = scenes.random_scene(3, 20, WIDTH, HEIGHT, dtype=F64, cov3d=kind == "cov3d")
-    areas = ellipse_areas(footprints_of(inputs) if kind == "footprints" else inputs)
+    areas = ellipse_areas(scenes.footprints_of(inputs) if kind == "footprints" else inputs)
     for area, pixels in zip(areas.tolist(), counted(inputs), strict=True):
         # A count differs from the area by pixels on the rim; a share of a box is not one of an
         # ellipse at the picture's edge.
@@ -55,7 +54,7 @@ def test_what_is_measured_is_counted_exactly_and_opacities_have_no_part_in_it(en
 @pytest.mark.parametrize("kind", ["scales", "cov3d", "footprints"])
 def test_gradients_are_finite_differences(kind):
     inputs = scenes.random_scene(5, 12, WIDTH, HEIGHT, dtype=F64, cov3d=kind == "cov3d")
-    inputs = footprints_of(inputs) if kind == "footprints" else inputs
+    inputs = scenes.footprints_of(inputs) if kind == "footprints" else inputs
     names = {"scales": ("scales", "rotations"), "cov3d": ("cov3d",), "footprints": ("conics",)}
 
     def areas(*shapes):

@@ -6,7 +6,6 @@ from functools import partial
 import pytest
 import scenes
 import torch
-from footprints import footprints_of
 
 from fragprune_plugins.engines.reference import (
     ReferenceEngine,
@@ -108,7 +107,7 @@ def test_behind_a_stop_derivatives_are_those_of_finite_differences():
 
 @pytest.mark.parametrize("features", [0, 2])
 def test_every_number_of_a_footprint_has_the_derivative_of_finite_differences(features):
-    made = footprints_of(smooth_scene(colors=True, features=features))
+    made = scenes.footprints_of(smooth_scene(colors=True, features=features))
     scene, leaves = scenes.leaves(made)
     del leaves["means2d_hook"]
     names = list(leaves)

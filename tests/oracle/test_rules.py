@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 import scenes
 import torch
-from footprints import footprints_of
 
 import reference_renderer
 from fragprune_plugins import constants
@@ -222,7 +221,7 @@ def test_the_near_plane_is_the_dialects(near):
 
 
 def test_of_equal_weights_the_first_in_depth_order_wins():
-    scene = footprints_of(scenes.stack([1 / 3, 0.25, 0.4], dtype=F64))
+    scene = scenes.footprints_of(scenes.stack([1 / 3, 0.25, 0.4], dtype=F64))
     scene.splats.means2d[:] = 8.0
     scene.splats.depths[:2] = torch.tensor([2.0, 1.0])  # 1/4 of the light, 1/3 of 3/4, 2/5 of 1/2
     drawn = draw(scene)
@@ -235,14 +234,14 @@ def test_footprints_draw_what_the_splats_do_that_they_were_projected_from():
     for seed, kind in enumerate(({}, {"compensation": "mip"}, {"features": 3, "offsets": True})):
         scene = scenes.random_scene(seed, 60, 37, 21, dtype=F64, **kind)
         tau = scenes.random_thresholds(seed, 60, dtype=F64)
-        whole, prints = draw(scene, tau), draw(footprints_of(scene), tau)
+        whole, prints = draw(scene, tau), draw(scenes.footprints_of(scene), tau)
         for name in ("image", "invdepth", "alpha", "fragments", "fragments_per_gaussian"):
             assert torch.equal(getattr(whole, name), getattr(prints, name)), name
         assert not prints.radii.any()
 
 
 def test_footprints_that_cannot_be_drawn_are_culled():
-    scene = footprints_of(scenes.stack([0.5] * 5, dtype=F64))
+    scene = scenes.footprints_of(scenes.stack([0.5] * 5, dtype=F64))
     splats = scene.splats
     splats.conics[0, 0] = -1.0
     splats.conics[1, 1] = 9.0

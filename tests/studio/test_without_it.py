@@ -160,34 +160,26 @@ def test_rows_with_nan_are_left_out_by_the_exporter_and_by_us():
     assert torch.equal(rows_exported(params, exporters(params, kept)), kept)
 
 
-@pytest.mark.parametrize("order", [[1, 0, 2], [0, 0, 1], [2, 1]])
-def test_another_order_is_refused(order):
-    params = model(3)
-    with pytest.raises(AlignmentError, match="in its order"):
-        rows_exported(params, exporters(params, torch.tensor(order)))
+def shifted(columns):
+    return columns | {"opacity": columns["opacity"] + 1e-3}
 
 
-def test_other_values_are_refused():
-    params = model(3)
-    columns = exporters(params, torch.arange(3))
-    columns["opacity"] = columns["opacity"] + 1e-3
-    with pytest.raises(AlignmentError):
-        rows_exported(params, columns)
-
-
-def test_one_of_two_equal_rows_cannot_be_told_and_is_refused():
-    params = {name: each[[0, 0, 1]] for name, each in model(2).items()}
-    with pytest.raises(AlignmentError):
-        rows_exported(params, exporters(params, torch.tensor([0, 2])))
-
-
-@pytest.mark.parametrize("name", ["x", "rot_3"])
-def test_a_file_without_a_column_is_refused(name):
-    params = model(3)
-    columns = exporters(params, torch.arange(3))
-    del columns[name]
-    with pytest.raises(AlignmentError, match=name):
-        rows_exported(params, columns)
+@pytest.mark.parametrize(
+    ("of", "rows", "change", "said"),
+    [
+        *(([0, 1, 2], rows, dict, "in its order") for rows in ([1, 0, 2], [0, 0, 1], [2, 1])),
+        ([0, 1, 2], [0, 1, 2], shifted, None),
+        ([0, 0, 1], [0, 2], dict, None),  # which of two equal rows it is cannot be told
+        *(
+            ([0, 1, 2], [0, 1, 2], lambda c, name=name: {k: c[k] for k in c if k != name}, name)
+            for name in ("x", "rot_3")
+        ),
+    ],
+)
+def test_another_order_other_values_and_a_missing_column_are_refused(of, rows, change, said):
+    params = {name: each[of] for name, each in model(3).items()}
+    with pytest.raises(AlignmentError, match=said):
+        rows_exported(params, change(exporters(params, torch.tensor(rows))))
 
 
 def test_of_a_model_without_thresholds_nothing_is_followed(monkeypatch):

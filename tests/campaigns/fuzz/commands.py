@@ -10,7 +10,6 @@ from pathlib import Path
 import torch
 from campaigns.fuzz.readers import Nonsense, Reader
 from cli.commands import run
-from core.hostile import camera_entry
 from finetune import tiny
 
 from fragprune_plugins.errors import UsageError
@@ -42,7 +41,7 @@ def scene() -> Path:
     write_ply(folder / "model.ply", truth)
     store = ThresholdStore.from_falloff(torch.full((40,), 0.3))
     sidecar.save(folder / "model.ply", store, settings={"iterations": 3})
-    (folder / "cameras.json").write_text(json.dumps([camera_entry()]))
+    (folder / "cameras.json").write_text(json.dumps(tiny.host_cameras(tiny.cameras(1))))
     command("finetune", folder)
     return folder
 
