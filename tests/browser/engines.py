@@ -104,6 +104,7 @@ def drawing(
         options: of ``playcanvas.js`` or ``spark.js``.
     """
     engine, *device = engine.split("-")
+    fov_y = float(2 * np.degrees(np.arctan(view.tan_fov_y)))
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         (root / "node_modules").symlink_to(engines() / "node_modules")
@@ -115,7 +116,7 @@ def drawing(
             "model": f"model{model.suffix}",
             "width": view.width,
             "height": view.height,
-            "camera": _camera(view),
+            "camera": {"matrix": placed(view), "fovY": fov_y},
             "webgpu": "webgpu" in device,
             "sorting": "cpu" if "cpu" in device else "auto",
             **options,
@@ -127,9 +128,8 @@ def drawing(
             assert errors or (tab.errors, tab.strangers) == ([], [])
 
 
-def _camera(view: View) -> dict[str, Any]:
-    """Camera to world for WebGL (y up, z backward), columns first; vertical field of view."""
+def placed(view: View) -> list[float]:
+    """Camera to world for WebGL (y up, z backward), columns first."""
     to_world = np.linalg.inv(view.viewmatrix.double().numpy().T)
     to_world[:, 1:3] *= -1
-    fov_y = float(2 * np.degrees(np.arctan(view.tan_fov_y)))
-    return {"matrix": to_world.T.ravel().tolist(), "fovY": fov_y}
+    return to_world.T.ravel().tolist()

@@ -5,17 +5,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from browser.chromium import opened, served
+from browser.compared import (
+    COUNT,
+    EDGE,
+    HALF_PIXELS,
+    a_model,
+    a_view,
+    falloffs,
+    firm,
+    ours,
+    psnr,
+)
 from browser.engines import NoEnginesError, drawing, engines, install
 from cli.commands import run
 
-from fragprune_plugins import RasterInputs, rasterize
-from fragprune_plugins.files.model import Model
-from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.workbench.models.cutoffs import decode, encode
 from fragprune_plugins.workbench.models.formats.ply import write_ply
-from fragprune_plugins.workbench.scenes.pinhole import look_at
 
 pytestmark = pytest.mark.browser
 Error = pytest.importorskip("playwright.sync_api").Error
@@ -28,13 +34,8 @@ each_engine = pytest.mark.parametrize("engine", ENGINES)
 each_playcanvas = pytest.mark.parametrize("engine", PLAYCANVAS)
 each_package = pytest.mark.parametrize("engine", PACKAGES)
 
-EDGE = float(np.exp(-4))
-"""Falloff at sqrt(8) standard deviations, beyond which neither engine draws."""
+DILATION = {**dict.fromkeys(PLAYCANVAS, HALF_PIXELS), "spark": 0.3}
 
-DILATION = {**dict.fromkeys(PLAYCANVAS, 0.3 / 4), "spark": 0.3}
-"""Pixels^2. PlayCanvas adds its 0.3 in half pixels."""
-
-COUNT = 600
 FAR = [0, 0, -50]
 """A place behind the camera."""
 
@@ -47,30 +48,9 @@ def installed():
         pytest.skip(str(error))
 
 
-def uniform(generator, low, high, *shape):
-    return torch.rand(*shape, generator=generator) * (high - low) + low
-
-
 @pytest.fixture(scope="module")
 def splat(view):
-    """Gaussians all over the view in no order, each with a colour and a cutoff of its own.
-
-    Depths are evenly spaced: a sort on the GPU leaves the order of equal ones to chance. Without
-    view-dependent colour: Spark keeps that in few bits, whatever one asks for.
-    """
-    random = torch.Generator().manual_seed(1)
-    depth = torch.linspace(2, 5, COUNT)[torch.randperm(COUNT, generator=random), None]
-    across = torch.stack([uniform(random, -w, w, COUNT) for w in (0.6, 0.45)], 1)
-    to_world = torch.linalg.inv(view.viewmatrix.T)
-    return Model(
-        xyz=torch.cat([across * depth, depth], 1) @ to_world[:3, :3].T + to_world[:3, 3],
-        f_dc=uniform(random, -1.5, 1.5, COUNT, 1, 3),
-        f_rest=torch.zeros(COUNT, 0, 3),
-        opacity=torch.logit(uniform(random, 0.02, 0.97, COUNT, 1)),
-        scaling=torch.log(uniform(random, 0.01, 0.15, COUNT, 3)),
-        rotation=torch.nn.functional.normalize(torch.randn(COUNT, 4, generator=random)),
-        thresholds=ThresholdStore.from_falloff(uniform(random, 1 / 255, 0.6, COUNT)),
-    )
+    return a_model(view)
 
 
 @pytest.fixture(scope="module")
@@ -80,8 +60,7 @@ def codes(splat):
 
 @pytest.fixture(scope="module")
 def view():
-    eye, target, up = torch.tensor([[0.1, -0.2, 0.0], [0.0, 0.0, 3.0], [0.0, -1.0, 0.0]])
-    return look_at(eye, target, up, width=160, height=120, fov_y=50)
+    return a_view()
 
 
 @pytest.fixture(scope="module")
@@ -111,24 +90,6 @@ def draw(browser, view):
     return picture
 
 
-def ours(splat, view, engine, thresholds):
-    """Our engine's, by the rules that the other engine follows by itself."""
-    inputs = RasterInputs(
-        view, splat.splats(), dilation=DILATION[engine], alpha_max=1, counts=True, planes=()
-    )
-    return rasterize(inputs, thresholds, engine="cpu")
-
-
-def falloffs(splat, truncated=True):
-    """The least falloff that is drawn of each Gaussian, (N,)."""
-    tau = torch.from_numpy(decode(encode(splat.falloff))) if truncated else torch.zeros(COUNT)
-    return tau.clamp(min=EDGE)
-
-
-def psnr(a, b):
-    return -10 * np.log10(np.mean((a - b) ** 2) + 1e-12)
-
-
 @each_engine
 @pytest.mark.parametrize("truncated", [False, True], ids=["whole", "cut"])
 def test_the_picture_is_that_of_our_engine(draw, engine, truncated, splat, view, cut):
@@ -138,13 +99,12 @@ def test_the_picture_is_that_of_our_engine(draw, engine, truncated, splat, view,
     fragment there may be drawn or not; the canvas rounds after every Gaussian.
     """
     tau = falloffs(splat, truncated)
-    near = [ours(splat, view, engine, tau**scale).fragments for scale in (0.97, 1.03)]
-    firm = (near[0] == near[1]).numpy()
-    want = ours(splat, view, engine, tau).image.permute(1, 2, 0).clamp(0, 1).numpy()
+    sure = firm(splat, view, DILATION[engine], tau)
+    want = ours(splat, view, DILATION[engine], tau).image.permute(1, 2, 0).clamp(0, 1).numpy()
     have = draw(engine, cut, bridge=truncated, plain=True) / 255
-    assert firm.mean() > 0.6
-    assert psnr(have[firm], want[firm]) > 50
-    assert (np.abs(have - want)[firm].max(axis=1) > 8 / 255).mean() < 0.001
+    assert sure.mean() > 0.6
+    assert psnr(have[sure], want[sure]) > 50
+    assert (np.abs(have - want)[sure].max(axis=1) > 8 / 255).mean() < 0.001
     assert psnr(have, want) > 42
 
 
@@ -155,7 +115,7 @@ CONFORMING = 40
 @each_engine
 @pytest.mark.parametrize("name", ["rims", "faint", "cloud"])
 def test_the_conformance_scenes_are_drawn_as_expected(draw, engine, name, tmp_path):
-    """PlayCanvas draws the cloud's smallest Gaussians smaller than 3DGS does; see DILATION."""
+    """PlayCanvas draws the cloud's smallest Gaussians smaller than 3DGS does; see HALF_PIXELS."""
     conformance = pytest.importorskip("cutoff_files")
     splat, camera = conformance.scene(name), conformance.cameras()["front"]
     path = tmp_path / "scene.ply"
@@ -164,7 +124,7 @@ def test_the_conformance_scenes_are_drawn_as_expected(draw, engine, name, tmp_pa
     want, _ = conformance.draw(splat, camera)
     if engine == "spark" or name != "cloud":
         assert psnr(have, want.permute(1, 2, 0).numpy()) > CONFORMING
-    want = ours(splat, camera.view(), engine, splat.falloff.clamp(min=EDGE)).image
+    want = ours(splat, camera.view(), DILATION[engine], splat.falloff.clamp(min=EDGE)).image
     assert psnr(have, want.permute(1, 2, 0).clamp(0, 1).numpy()) > CONFORMING + 2
 
 
@@ -172,7 +132,7 @@ def test_the_conformance_scenes_are_drawn_as_expected(draw, engine, name, tmp_pa
 def test_quads_end_where_ellipses_do(browser, engine, splat, view, cut):
     """A rectangle around an ellipse has 4 / pi times its area."""
     tau = falloffs(splat)
-    ellipses = int(ours(splat, view, engine, tau).fragments.sum())
+    ellipses = int(ours(splat, view, DILATION[engine], tau).fragments.sum())
     with drawing(browser, engine, cut, view, bridge=True, plain=True) as page:
         quads = page.quads()["pixels"]
     assert quads == pytest.approx(4 / np.pi * ellipses, rel=0.03)

@@ -16,7 +16,11 @@ from finetune import tiny
 
 from fragprune_plugins.workbench.demo import work as demo_page
 
-pytestmark = [pytest.mark.browser, pytest.mark.filterwarnings("ignore::DeprecationWarning")]
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.filterwarnings("ignore::DeprecationWarning"),
+    pytest.mark.timeout(900),  # the site runs the tutorial: a minute, many on a busy machine
+]
 
 ROOT = Path(__file__).parents[2]
 PHONE = {"width": 390, "height": 844}
