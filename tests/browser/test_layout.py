@@ -113,6 +113,15 @@ def test_plots_can_be_read(shown, name, scheme):
         assert max(contrast(np.median(levels), each) for each in words) > READABLE
 
 
+@pytest.mark.parametrize("name", ["demo", "report"])
+def test_curves_stay_large_enough_for_their_letters(shown, name):
+    """A phone scrolls them: at its width letters have six pixels."""
+    with shown(**PHONE, is_mobile=True, has_touch=True) as tab:
+        plot = tab.page.locator(PLOTS[name]).first
+        plot.scroll_into_view_if_needed()
+        assert plot.bounding_box()["width"] > 550
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("name", OURS)
 def test_text_can_be_read(shown, name, scheme):
