@@ -29,8 +29,7 @@ from fragprune_3dgs_fork.fork import (
     rests_after_densification,
 )
 from fragprune_3dgs_fork.rasterizer import Output
-from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, plain, reading
-from fragprune_graphdeco.kernels import ORDER, SPLAT, read_kernels
+from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, kernels, plain, reading
 from fragprune_plugins.adapting import (
     CommandLine,
     EngineError,
@@ -269,11 +268,11 @@ class ForkAdapter(GraphdecoAdapter):
             return [Finding.error("not-plain", MODEL, others[0], "a plain 3DGS model")]
         fork = read_fork(repo)
         served = replace(self.command_line(repo), scripts=fork.scripts)
-        read = partial(read_kernels, repo, kernel=SPLAT)
+        kernel = partial(kernels.read_kernels, repo, kernel=kernels.SPLAT)
         return [
             *self.other_host(repo, [*reading.renamed(repo), *reading.compiled(repo, fork.scripts)]),
             *fork.findings,
-            *(each for found in map(read, fork.outputs) for each in found if each.code == ORDER),
+            *(f for found in map(kernel, fork.outputs) for f in found if f.code == kernels.ORDER),
             *read_getters(fork),
             *(reading.read_flags(repo, served) if fork.scripts else ()),
             *self._groups(repo),
