@@ -268,16 +268,11 @@ class ForkAdapter(GraphdecoAdapter):
             return [Finding.error("not-plain", MODEL, others[0], "a plain 3DGS model")]
         fork = read_fork(repo)
         served = replace(self.command_line(repo), scripts=fork.scripts)
-        read = partial(kernels.read_kernels, repo, kernel=kernels.SPLAT)
+        kernel = partial(kernels.read_kernels, repo, kernel=kernels.SPLAT)
         return [
             *self.other_host(repo, [*reading.renamed(repo), *reading.compiled(repo, fork.scripts)]),
             *fork.findings,
-            *(
-                each
-                for found in map(read, fork.outputs)
-                for each in found
-                if each.code == kernels.ORDER
-            ),
+            *(f for found in map(kernel, fork.outputs) for f in found if f.code == kernels.ORDER),
             *read_getters(fork),
             *(reading.read_flags(repo, served) if fork.scripts else ()),
             *self._groups(repo),
