@@ -16,7 +16,6 @@ from fragprune_plugins.learning.pressure import (
     OWN_PRESSURE,
     PORTABLE_ELASTICITY,
     ElasticPressure,
-    FixedPressure,
     PressureController,
     PressureRule,
 )
@@ -81,8 +80,8 @@ class _Weighted(Goal):
     def pressure(self, elasticity: float, itself: bool) -> PressureRule:
         """The weight; without one, fixed where there is no loss to follow, else elastic."""
         if self.weight is not None:
-            return FixedPressure(self.weight)
-        return FixedPressure(self.own) if itself else self.elastic(elasticity)
+            return PressureRule(self.weight)
+        return PressureRule(self.own) if itself else self.elastic(elasticity)
 
     def elastic(self, elasticity: float) -> PressureRule:
         """A pressure that follows the loss."""
@@ -154,7 +153,7 @@ class Control(Goal):
 
     def pressure(self, elasticity: float, itself: bool) -> PressureRule:
         """None."""
-        return FixedPressure(0.0)
+        return PressureRule(0.0)
 
 
 GOALS: dict[str, type[Goal]] = {each.name: each for each in (Pressure, Fewer, Portable, Control)}

@@ -64,16 +64,12 @@ class Observation:
 
 @dataclass
 class PressureRule:
-    """Gives lambda for the next step: ``value``."""
+    """Gives lambda for the next step: ``value``, the same in all steps if it is no other rule."""
 
     value: float
 
     def observe(self, step: Observation) -> None:
         """Take the figures of a step that is over."""
-
-
-class FixedPressure(PressureRule):
-    """Keeps lambda the same in all steps."""
 
 
 @dataclass

@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.goals import Goal, Pressure
-from fragprune_plugins.learning.pressure import ELASTICITY, PressureRule
+from fragprune_plugins.learning.pressure import ELASTICITY, ElasticPressure, PressureRule
 from fragprune_plugins.types import Rim, is_stop
 
 Train = Literal["opacity", "appearance", "all"]
@@ -23,12 +23,14 @@ USUAL_STOP = 0.01
 _DEFAULT_GOAL = Pressure()
 _DECAY = 0.1  # learning rates fall to this share over the run, exponentially
 
-# Where all moves; docs/results.md has the runs that chose both.
+# Where all moves; docs/results.md has the runs that chose these.
 _LEARNING_STEPS = 2000
 """Thresholds learn in the last so many, of one view each: where shapes follow, truncating for
 longer still improves the training views and no longer the others."""
 _ELASTICITY_OF_ALL = 2 * ELASTICITY
 """Of the default pressure: shapes that follow repair deeper cuts."""
+_LEAST_AFTER_DROPOUT = 2e-4
+"""The default pressure's lower end after a warm-up with dropout."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,10 @@ class Settings:
             elasticity: of the default pressure; by what ``train`` names when None.
         """
         own = _ELASTICITY_OF_ALL if self.train == "all" else ELASTICITY
-        return self.goal.pressure(own if elasticity is None else elasticity, self.itself)
+        rule = self.goal.pressure(own if elasticity is None else elasticity, self.itself)
+        if isinstance(rule, ElasticPressure) and self.dropout and self.warmup:
+            rule.value = rule.least = _LEAST_AFTER_DROPOUT
+        return rule
 
     def stop_of(self, own: float | None) -> float | None:
         """The stop at which a model is drawn that came with its own, or with None."""

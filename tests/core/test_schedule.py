@@ -12,9 +12,9 @@ from fragprune_plugins.learning.pressure import (
     LEAST_PRESSURE,
     MOST_PRESSURE,
     ElasticPressure,
-    FixedPressure,
     Observation,
     PressureController,
+    PressureRule,
 )
 from fragprune_plugins.learning.schedule import USUAL_STOP, JointSchedule, Schedule, Settings
 from fragprune_plugins.workbench.goals import AtMost, Faster, parse_goal
@@ -155,13 +155,35 @@ def test_settings_choose_their_pressure():
     assert Settings(train="opacity").make_pressure() == ElasticPressure()
     assert Settings().make_pressure() == ElasticPressure(elasticity=2 * ELASTICITY)
     assert JointSchedule(Settings(), 1).make_pressure() == ElasticPressure()
-    assert Settings(goal=Pressure(3e-4)).make_pressure() == FixedPressure(3e-4)
+    assert Settings(goal=Pressure(3e-4)).make_pressure() == PressureRule(3e-4)
     assert isinstance(Settings(goal=Fewer(1.8)).make_pressure(), PressureController)
-    assert Settings(goal=Control()).make_pressure() == FixedPressure(0.0)
+    assert Settings(goal=Control()).make_pressure() == PressureRule(0.0)
+
+
+@pytest.mark.parametrize(
+    ("settings", "least"),
+    [
+        (Settings(5000, dropout=0.2), 2e-4),
+        (Settings(1000, dropout=0.2), LEAST_PRESSURE),  # thresholds learn from the first step on
+        (Settings(5000, dropout=0.0), LEAST_PRESSURE),
+        (Settings(5000), LEAST_PRESSURE),
+        (Settings(5000, dropout=0.2, train="opacity"), LEAST_PRESSURE),
+    ],
+)
+def test_a_warm_up_with_dropout_bears_more_pressure(settings, least):
+    pressure = settings.make_pressure()
+    assert pressure.value == least
+    pressure.observe(Observation(0.5, fragments=40.0, ratio=1.0, loss=1e-9))
+    assert pressure.value == least
+
+
+def test_a_pressure_that_is_given_is_not_changed_by_dropout():
+    given = Settings(5000, dropout=0.2, goal=Pressure(1e-4)).make_pressure()
+    assert given == PressureRule(1e-4)
 
 
 def test_a_fixed_pressure_stays():
-    pressure = FixedPressure(2e-4)
+    pressure = PressureRule(2e-4)
     for step in range(10):
         pressure.observe(Observation(step / 10, fragments=10, ratio=2.0, loss=0.5))
     assert pressure.value == 2e-4
