@@ -101,11 +101,10 @@ def check_fields(thing: Any, **shapes: tuple[int | None, ...]) -> None:
     Args:
         shapes: by a field's name.
     """
-    for each in fields(thing):
-        if each.name in shapes:
-            check = require_tensor if each.default is MISSING else check_tensor
-            name, value = f"{type(thing).__name__}.{each.name}", getattr(thing, each.name)
-            check(name, value, *shapes[each.name])
+    own, kind = thing.__dataclass_fields__, type(thing).__name__
+    for name, shape in shapes.items():
+        check = require_tensor if own[name].default is MISSING else check_tensor
+        check(f"{kind}.{name}", getattr(thing, name), *shape)
 
 
 def check_lens(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from typing import Any, Final, get_args
 
@@ -126,15 +126,18 @@ def native_inputs(
     )
 
 
-def new_outputs(inputs: RasterInputs, new: Callable[..., Tensor]) -> dict[str, Tensor]:
+def new_outputs(
+    inputs: RasterInputs, new: Callable[..., Tensor], planes: Collection[str]
+) -> dict[str, Tensor]:
     """Room for what is drawn of any Gaussians by any engine, by the names of fragprune_outputs.
 
     Args:
         new: makes a tensor of a shape, float32 unless it is given a ``dtype``.
+        planes: those to have room for.
     """
     n, size, whole = len(inputs.splats), (inputs.view.height, inputs.view.width), torch.int32
     made = {"image": new(3, *size), "radii": new(n, dtype=whole)}
-    made |= {name: new(int(name in inputs.planes), *size) for name in ("invdepth", "alpha")}
+    made |= {name: new(int(name in planes), *size) for name in ("invdepth", "alpha")}
     if inputs.splats.features is not None:
         made["features"] = new(inputs.splats.features.shape[1], *size)
     if inputs.counts:

@@ -18,8 +18,6 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import torch
-
 from fragprune_plugins.constants import VERSION
 from fragprune_plugins.engines.cuda.kernels import cache_folder, digest_of_sources
 from fragprune_plugins.errors import EngineError, InputError, ProofError
@@ -75,9 +73,9 @@ def _read_or_prove(
     shape: tuple[Any, ...],
 ) -> Proof:
     """A kept proof of a call of this shape, else a new one, which is kept if it fails, too."""
-    device = drawn[session.dialect.means].device
-    engine = session.engine(device)
-    processor = torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
+    means = drawn[session.dialect.means]
+    engine = session.engine(means.device)
+    processor = session.processor(means.device)
     known = (VERSION, digest_of_sources(), session.adapter.name, engine.name, processor, shape)
     key = hashlib.sha256(repr(known).encode()).hexdigest()[:16]
     file = sys.modules[call.seam.module].__file__

@@ -165,6 +165,10 @@ class SessionState:
             self.engines[device] = engine
         return self.engines[device]
 
+    def processor(self, device: torch.device) -> str:
+        """The name of a GPU, or the kind of another device."""
+        return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
+
     def model_of(self, call: SeamCall) -> Any:
         """The model that a call concerns, or None; means from the adapter identify a model too."""
         found = self.adapter.model_of(call)

@@ -38,7 +38,6 @@ from fragprune_plugins.workbench.ranks import Ranks
 
 if TYPE_CHECKING:
     from fragprune_plugins.types import RasterOutputs
-    from fragprune_plugins.workbench.ranks import Ranks
 
 _SENT = ("means", "opacities", "scales", "rotations", "cov3d")
 """Attributes that are sent as they are; colours and thresholds go with them."""

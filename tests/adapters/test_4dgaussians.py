@@ -13,13 +13,14 @@ import torch
 from miniatures import runs
 from miniatures.moving import MovingHost
 from miniatures.vanilla_3dgs import Notes
+from PIL import Image
 from scenes import blended
 
 from fragprune_4dgaussians import MovingGaussians
 from fragprune_4dgaussians.config import PythonFile
 from fragprune_plugins.errors import HostFailed, HostNeedsError, ModelFileError, UsageError
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.injection.launch import run
+from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.testing.host import joint, running
 from fragprune_plugins.workbench.models import model as models
@@ -179,6 +180,19 @@ def test_a_host_that_starts_itself_again_fails(mini, photographs, tmp_path):
     words = command(mini, photographs, tmp_path / "out", "--nan_at", 3)
     with pytest.raises(HostFailed, match="start itself again"):
         run(words, replace(OPTIONS, stage="off"))
+
+
+def test_its_render_script_draws_with_thresholds(mini, photographs, output):
+    summary = run(command(mini, photographs, output), replace(OPTIONS, stage="finetune"))
+    words = [str(mini / "render.py"), "-m", str(output), "--skip_train", "--iteration"]
+    drawn = []
+    for thresholds in (True, False):
+        if not thresholds:
+            summary.model_after.with_suffix(".fragprune.safetensors").unlink()
+        run([*words, str(LAST + 9)], RunOptions(device="cpu", stage="off"))
+        (picture,) = (output / "test" / f"ours_{LAST + 9}" / "renders").glob("*.png")
+        drawn.append(Image.open(picture).tobytes())
+    assert drawn[0] != drawn[1]
 
 
 # -- configuration ---------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import torch
 from miniatures import runs
 from miniatures.rain_gs import RainHost
 from miniatures.runs import OPTIONS, check_stage_two, miniature
-from miniatures.vanilla_3dgs import Notes, joint
+from miniatures.vanilla_3dgs import Notes, joint, running
 
 from fragprune_plugins import rasterize
 from fragprune_plugins.files import sidecar
@@ -28,6 +28,14 @@ mini, of = miniature(RainHost, RainGS, driver=RainHost)
 
 
 # -- which host, and its rasterizer ----------------------------------------------------------------
+
+
+def test_our_rasterizer_answers_before_anything_is_compiled_and_leaves_again(mini):
+    with running(**of(mini)):
+        ours = import_module(PACKAGE)
+        renderer = import_module("gaussian_renderer")
+        assert renderer.GaussianRasterizer is ours.GaussianRasterizer
+    assert PACKAGE not in sys.modules
 
 
 def test_dilation_reaches_the_engine_and_depth_comes_back_without_a_gradient(mini):

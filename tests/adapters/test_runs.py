@@ -80,6 +80,21 @@ def test_a_neutral_run_is_the_hosts_own_to_the_bit(photographs, tmp_path):
     assert not list(tmp_path.rglob("*.safetensors"))
 
 
+def test_learning_from_an_iteration_on_freezes_from_there(photographs, tmp_path):
+    """One run, its first ten iterations the host's own, densification included."""
+    settings = Settings(train="opacity")
+    options = RunOptions(stage="finetune", from_iter=12, device="cpu", settings=settings)
+    flags = ("--save_iterations", 14, "--checkpoint_iterations", 12)
+    out = tmp_path / "out"
+    summary = run(command(photographs, out, 20, *flags), options)
+    capture, _ = torch.load(out / "chkpnt12.pth", weights_only=False)
+    final = read_ply(summary.model_after)
+    assert torch.equal(capture[1].detach(), final.xyz)
+    assert torch.equal(capture[4].detach(), final.scaling)
+    assert len(final.xyz) != 150
+    assert summary.steps == 7  # of 13 to 20: hosts take no step in the last
+
+
 @pytest.fixture(scope="module")
 def stage_one(photographs, tmp_path_factory):
     """A finished stage 1 of ten iterations."""

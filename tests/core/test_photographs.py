@@ -11,10 +11,10 @@ from fragprune_graphdeco.adapter import resolution
 from fragprune_plugins.errors import NotComparedError
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.workbench.demo import demo
+from fragprune_plugins.workbench.demo import work
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
-HOST = HostRepo(Path(demo.__file__).with_name("host"))
+HOST = HostRepo(Path(work.__file__).with_name("host"))
 SIDES = st.integers(1, 6000)
 
 

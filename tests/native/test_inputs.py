@@ -13,7 +13,7 @@ from fragprune_plugins.engines.calling import address, native_arrays, native_inp
 from fragprune_plugins.engines.cpu.engine import CpuEngine, binding
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import EngineError
-from fragprune_plugins.slicing.cutting import slice_by
+from fragprune_plugins.slicing.cutting import Way, slice_by
 from fragprune_plugins.slicing.structs import Spacetime
 from fragprune_plugins.types import Footprints, RasterInputs, Splats, View
 
@@ -209,14 +209,8 @@ class Doubting:
     def empty(self, *shape: int) -> torch.Tensor:
         return torch.empty(shape)
 
-    def slice(self, *structs: ctypes.Structure) -> None:
-        self.call(self.calls.fragprune_slice, *structs)
-
-    def unslice(self, *structs: ctypes.Structure) -> None:
-        self.call(self.calls.fragprune_unslice, *structs)
-
-    def call(self, function: Any, given: Spacetime, *more: ctypes.Structure) -> None:
-        error = binding.Error()
+    def call(self, way: Way, given: Spacetime, *more: ctypes.Structure) -> None:
+        error, function = binding.Error(), getattr(self.calls, f"fragprune_{way}")
         structs = [ctypes.byref(struct) for struct in (given, *more, error)]
         for name in dict(Spacetime._fields_).keys() & set(binding.ARRAYS):
             held = getattr(given.lengths, name)

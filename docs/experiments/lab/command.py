@@ -21,9 +21,9 @@ from fragprune_plugins.workbench.commands.options import (
     Function,
     Number,
     SceneOptions,
+    bundled,
     engine_options,
     scene_options,
-    together,
 )
 from lab.catalogue import EXPERIMENTS, QUESTIONS
 
@@ -54,6 +54,11 @@ def _seeds(ctx: click.Context, param: click.Parameter, value: str) -> tuple[int,
         raise click.BadParameter(f"{value!r} is not a list such as 0,1,2.") from error
 
 
+def _as_given(options: dict[str, Any]) -> dict[str, Any]:
+    """Nothing is made of the options: a command gets each by its name."""
+    return {}
+
+
 _out_option = click.option(
     "--out", type=FILE, required=True, help="Folder for the table, plot, configuration and arms."
 )
@@ -70,7 +75,8 @@ def _seeds_option(default: str) -> Callable[[Function], Function]:
     )
 
 
-_training_options = together(
+_training_options = bundled(
+    _as_given,
     click.argument("model", type=MODEL),
     scene_options(),
     _out_option,
@@ -159,7 +165,8 @@ for _name, _make in EXPERIMENTS.items():
     )(_training_options(partial(_train, _name)))
 
 
-_views_options = together(
+_views_options = bundled(
+    _as_given,
     click.argument("models", metavar="MODEL...", type=MODEL, nargs=-1, required=True),
     scene_options(),
     _out_option,

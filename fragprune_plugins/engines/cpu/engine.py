@@ -54,7 +54,7 @@ class _Drawing:
     def draw(self, wanted: Wanted) -> dict[str, Tensor]:
         """Run the forward pass."""
         view, splats, fresh = self.inputs.view, self.inputs.splats, partial(empty, self.workspace)
-        drawn = new_outputs(self.inputs, fresh)
+        drawn = new_outputs(self.inputs, fresh, self.inputs.planes)
         if isinstance(splats, Splats) and splats.flat and "surface" in self.inputs.planes:
             drawn["surface"] = fresh(6, view.height, view.width)
         if self.inputs.scores:

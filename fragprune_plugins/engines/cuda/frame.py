@@ -9,7 +9,6 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Callable, Hashable
-from dataclasses import replace
 from functools import partial
 from typing import Final, Protocol, get_args
 
@@ -278,8 +277,8 @@ class Drawing:
         tiles, pixels = self._across * self._down, inputs.view.width * inputs.view.height
         keep = bool(wanted)
         cleared, scratch, kept = self._room(capacity, keep, keep and deterministic)
-        everything = replace(inputs, planes=get_args(Plane))  # the kernels spare no plane
-        outputs = new_outputs(everything, partial(torch.empty, device=where))
+        planes = get_args(Plane)  # the kernels spare none
+        outputs = new_outputs(inputs, partial(torch.empty, device=where), planes)
         for name in outputs.keys() & {"fragments_per_gaussian", "wins_per_gaussian"}:
             outputs[name].zero_()  # the kernels add to these
         weights = torch.zeros(n, dtype=torch.int64, device=where) if inputs.scores else None

@@ -345,9 +345,9 @@ def _candidates(model: Model) -> dict[str, Candidate]:
     for cut in CUTS:
         thresholds = cut.thresholds(itself.splats.opacities)
         thresholds = thresholds if own is None else torch.maximum(own, thresholds)
-        found[cut.name] = Candidate(model, cut=thresholds)
+        found[cut.name] = itself.sharing(cut=thresholds)
     if model.stop is None:
-        found[f"a stop at {USUAL_STOP:g}"] = Candidate(model.with_rules(stop=USUAL_STOP))
+        found[f"a stop at {USUAL_STOP:g}"] = itself.sharing(model=model.with_rules(stop=USUAL_STOP))
     if model.pruned:
         found[UNTRUNCATED] = Candidate(model.untruncated())
     return found

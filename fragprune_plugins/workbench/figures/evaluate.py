@@ -61,6 +61,12 @@ class Candidate:
         """The activated Gaussians."""
         return self.model.splats()
 
+    def sharing(self, **others: Any) -> Candidate:
+        """The same Gaussians, drawn otherwise; they are activated once for both."""
+        other = replace(self, **others)
+        vars(other)["splats"] = self.splats
+        return other
+
     def inputs(self, view: View) -> RasterInputs:
         """The inputs of one view; only the image is asked for."""
         return RasterInputs(view, self.splats, planes=(), **{**self.model.rules, **self.drawing})

@@ -123,9 +123,10 @@ def _mask_path(masks: Path, name: str) -> Path | None:
 
 def _rotation(quaternion: tuple[float, ...]) -> Tensor:
     """(3, 3) float64 rotation from a quaternion w, x, y, z of any length but 0."""
-    if not 0 < math.hypot(*quaternion) < math.inf:
+    length = math.hypot(*quaternion)
+    if not 0 < length < math.inf:
         raise ValueError(f"the quaternion {list(quaternion)}, which is no rotation")
-    w, *xyz = quaternion
+    w, *xyz = (each / length for each in quaternion)
     return torch.from_numpy(Rotation.from_quat([*xyz, w]).as_matrix())
 
 

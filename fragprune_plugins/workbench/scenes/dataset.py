@@ -27,7 +27,6 @@ from fragprune_plugins.workbench.scenes.posed import Posed
 
 if TYPE_CHECKING:
     from PIL.Image import Image
-    from torch import Tensor
 
     from fragprune_plugins.workbench.scenes.lenses import Pixels
 

@@ -6,10 +6,10 @@ the way between the least and the largest logarithm; 16 bits unused. Harmonics, 
 degree needs in fours: half floats, red green blue of one coefficient after the other.
 
 A page that is written has them in few bytes (``compact``). Gaussians are sorted along a Z-order
-curve, their numbers become codes, and bytes of equal meaning
-lie one after the other, deflated. Numbers are rounded as in a .spz file where there are more than
-256 different ones: a model of such a file stays what it is. ``static/compact.js`` makes tables of
-the bytes. These are, of N Gaussians and before they are deflated:
+curve, their numbers become codes, and bytes of equal meaning lie one after the other, deflated.
+Numbers are rounded as in a .spz file where there are more than 256 different ones: a model of such
+a file stays what it is. ``static/compact.js`` makes tables of the bytes. These are, of N Gaussians
+and before they are deflated:
 
 * Means: of x, y and z, 4 planes of N bytes each, the lowest first. They hold the difference to the
   Gaussian before in units of ``2**-bits``, doubled, and inverted where it is negative.

@@ -6,6 +6,7 @@ import csv
 import json
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -200,7 +201,9 @@ def test_ctrl_c_keeps_finished_arms(words, trained, monkeypatch, tmp_path):
         (["rulers", "x.ply"], "rulers"),
     ],
 )
-def test_contradictions_are_usage_errors(words, said, tmp_path):
+def test_contradictions_are_usage_errors(words, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("x.ply").touch()
     result = run(*words, "--data", tmp_path, "--out", tmp_path / "out")
     assert result.exit_code == 2
     assert said in result.stderr
@@ -223,7 +226,7 @@ def test_the_configuration_tells_models_apart(words, trained, tmp_path):
 
 def test_an_arm_truncates_from_where_it_opens(words, trained, monkeypatch):
     """Until then it trains as the control does, to the bit."""
-    learned = Settings(iterations=3, train="opacity", goal=Pressure(1e-2))
+    learned = Settings(iterations=3, train="opacity", goal=Pressure(1e-2), stop=None)
     arms = (
         Arm("control", "", replace(learned, goal=Control())),
         *(Arm("learned", str(opens), learned, warmup=opens) for opens in (0, 3)),

@@ -56,7 +56,7 @@ def test_a_training_follows_a_rule_as_opacities_move(scene, rule):
 def test_a_rule_that_cuts_nothing_trains_as_the_control_does(scene):
     """Nothing presses on fragments."""
     model, dataset = scene
-    settings = Settings(iterations=6, train="opacity")
+    settings = Settings(iterations=6, train="opacity", stop=None)
     ruled = finetune_by(falloff_threshold(1e-6), model, dataset, settings)
     control = finetune(model, dataset, Settings(iterations=6, train="opacity", goal=Control()))
     assert torch.equal(ruled.model.opacity, control.model.opacity)
