@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -30,9 +30,6 @@ from fragprune_plugins.types import RasterInputs, RasterOutputs, one_line
 from fragprune_plugins.workbench.finetune.losses import photometric_loss
 from fragprune_plugins.workbench.finetune.processes import Processes, SharedStage
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
-
-if TYPE_CHECKING:
-    from fragprune_plugins.workbench.finetune.resuming import Keeper
 
 # Learning rates at the start of stage 2, the hosts' own; all decay with the opacity's. Positions
 # (times the scene's extent) take a tenth of the hosts' first: a tenth of that held out less, and a
@@ -72,6 +69,16 @@ class FinetuneResult:
     __repr__ = one_line
 
 
+class Keeping(Protocol):
+    """Writes the checkpoints of a training."""
+
+    def due(self, step: int) -> bool:
+        """Whether it is time for one after a step."""
+
+    def keep(self, training: Training) -> None:
+        """Write one, between two steps."""
+
+
 class Training:
     """One fine-tuning under way.
 
@@ -86,7 +93,6 @@ class Training:
         curves: one point for each step.
         done: steps.
         between: no step is under way.
-        keeper: writes its checkpoints, once it learns.
         started: ``time.perf_counter()`` at its start, minus what was trained before a checkpoint.
     """
 
@@ -104,7 +110,6 @@ class Training:
         self.engine, self.processes = engine, processes
         self.curves: list[StepStats] = []
         self.done, self.between = 0, True
-        self.keeper: Keeper | None = None
         self.started = time.perf_counter()
         known = start.thresholds if settings.goal.presses else None
         self.stage = SharedStage(
@@ -154,9 +159,9 @@ class Training:
         """Wall-clock seconds of all steps, also of those before a checkpoint."""
         return time.perf_counter() - self.started
 
-    def learn(self, keeper: Keeper, progress: bool) -> None:
+    def learn(self, keeper: Keeping, progress: bool) -> None:
         """All steps that are not done yet."""
-        self.keeper, settings, total = keeper, self.settings, self.settings.iterations
+        settings, total = self.settings, self.settings.iterations
         steps = order(self.dataset.train, total, settings.views_per_step, settings.seed)
         with (
             tqdm(
@@ -171,11 +176,12 @@ class Training:
         ):
             for shots in islice(steps, self.done, None):
                 self.between = False
-                self._step(shots, waiting)
+                due = keeper.due(self.done + 1)
+                self._step(shots, waiting, due)
                 self.between = True
                 if self.processes.may_end:
                     waiting()
-                if self.processes.keeps(self):
+                if self.processes.keeps(due):
                     keeper.keep(self)
                 bar.update()
                 if self.curves and self.done % max(1, total // _POSTFIXES) == 0:
@@ -183,7 +189,7 @@ class Training:
                     bar.set_description("warm-up" if warming else "fine-tuning", refresh=False)
                     bar.set_postfix(**self._how_it_goes())
         self.stage.close()
-        self.processes.finished(self)
+        self.processes.finished(self._learned(), self.done)
 
     def _how_it_goes(self) -> dict[str, str]:
         """Means over as many steps as see all views: these differ more than steps do."""
@@ -201,7 +207,11 @@ class Training:
         if self.processes.first:
             installed().tell(hookspecs.fragprune_step, stats=stats)
 
-    def _step(self, shots: Sequence[Shot], waiting: Waiting) -> None:
+    def _learned(self) -> dict[str, Tensor]:
+        """All that learns, by name."""
+        return {**self.parameters(), "thresholds": self.stage.store.logits}
+
+    def _step(self, shots: Sequence[Shot], waiting: Waiting, due: bool) -> None:
         stage = self.stage
         stage.begin(lambda: torch.sigmoid(self.model.opacity.detach()))
         self._plain_first = not all(map(stage.knows, shots))
@@ -212,7 +222,7 @@ class Training:
             stage.lost(loss)
             torch.autograd.backward(loss if pressure is None else loss + pressure)
         stage.picture = ", ".join(shot.name for shot in shots)
-        self.processes.went_backward(self, shots, waiting)
+        self.processes.went_backward(stage, self._learned(), shots, waiting, due=due)
         rates = self.rates.items()
         for group, (name, base) in zip(self.optimizer.param_groups, rates, strict=True):
             group["lr"] = stage.rate(name, base)
@@ -222,7 +232,7 @@ class Training:
         self.optimizer.zero_grad(set_to_none=True)
         stage.end()
         self.done += 1
-        self.processes.stepped(self)
+        self.processes.stepped(self._learned(), self.done)
 
     def _draw(self, shot: Shot) -> tuple[RasterOutputs, Tensor | None]:
         """Draw a view with its thresholds; also return the pressure."""

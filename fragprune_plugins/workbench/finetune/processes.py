@@ -8,7 +8,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from itertools import accumulate
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,9 +21,6 @@ from fragprune_plugins.learning.waiting import Waiting
 from fragprune_plugins.workbench.goals import Faster
 from fragprune_plugins.workbench.ranks import Ranks, fingerprint
 from fragprune_plugins.workbench.scenes.dataset import Shot
-
-if TYPE_CHECKING:
-    from fragprune_plugins.workbench.finetune.loop import Training
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _COMPARE = 100  # steps from one comparison of copies to the next
@@ -109,19 +106,28 @@ class Processes:
         return self.ranks.share(shots)
 
     @torch.no_grad()
-    def went_backward(self, training: Training, shots: Sequence[Shot], waiting: Waiting) -> None:
+    def went_backward(
+        self,
+        stage: SharedStage,
+        learned: Mapping[str, Tensor],
+        shots: Sequence[Shot],
+        waiting: Waiting,
+        *,
+        due: bool,
+    ) -> None:
         """Take over from all processes gradients and figures; and whether to end, or to keep.
+
+        Args:
+            learned: all that learns, by name.
+            due: it is time for a checkpoint after this step, by this process.
 
         Raises:
             RanksError: another process is gone.
         """
         if not self.several:
             return
-        stage, keeper = training.stage, training.keeper
-        leaves = [*training.parameters().values(), stage.store.logits]
-        due = keeper is not None and keeper.due(training.done + 1)
         flags = [*(waiting.number == number for number in _SIGNALS), due]
-        rows = stage.figures()
+        rows, leaves = stage.figures(), [*learned.values()]
         table, (*signals, self._due) = self.exchange(leaves, rows, len(shots), flags)
         if rows:
             stage.share(shots, table)
@@ -130,22 +136,19 @@ class Processes:
         if came and not waiting.number:
             signal.raise_signal(came[0])  # it came to another process: all end after this step
 
-    def stepped(self, training: Training) -> None:
+    def stepped(self, learned: Mapping[str, Tensor], step: int) -> None:
         """Compare all that learns, from time to time; raises RanksError if processes differ."""
-        if training.done % _COMPARE == 0:
-            self.finished(training)
+        if step % _COMPARE == 0:
+            self.finished(learned, step)
 
-    def finished(self, training: Training) -> None:
+    def finished(self, learned: Mapping[str, Tensor], step: int) -> None:
         """Compare all that learns, after the last step; raises RanksError if processes differ."""
         if self.several:
-            learned = training.parameters() | {"thresholds": training.stage.store.logits}
-            self.compare(learned, training.done)
+            self.compare(learned, step)
 
-    def keeps(self, training: Training) -> bool:
+    def keeps(self, due: bool) -> bool:
         """Whether it is time for a checkpoint after this step, as all decided in it."""
-        if self.several:
-            return self._due
-        return training.keeper is not None and training.keeper.due(training.done)
+        return self._due if self.several else due
 
     def described(self, configuration: dict[str, Any]) -> dict[str, Any]:
         """What decides the result, in the words of all processes together."""
