@@ -85,9 +85,10 @@ def read_plain(repo: HostRepo) -> Plain:
 def _read_plain(repo: HostRepo) -> Plain:
     module, name = next(_models(repo), ("", ""))
     if not module:
-        return Plain((*(each for each, _ in _of_drawing(repo)), _without(repo)))
+        own = dict(_of_drawing(repo, _own_renderers(repo)))
+        return Plain((*own, _without(repo)))
     flat = list(_scales(repo, module, name))
-    moving = dict(_of_drawing(repo))
+    moving = dict(_of_drawing(repo, _renderers(repo)))
     drawn = list(moving)
     made = [each for each in drawn if "3D_filter" not in each]
     moving |= (getters := dict(_of_getters(repo, module, name)))
@@ -362,12 +363,12 @@ def _own_renderers(repo: HostRepo) -> list[str]:
     return [own if each == "__init__" else f"{own}.{each}" for each in stems]
 
 
-def _of_drawing(repo: HostRepo) -> Iterator[tuple[str, bool]]:
+def _of_drawing(repo: HostRepo, modules: Iterable[str]) -> Iterator[tuple[str, bool]]:
     """Inputs of the rasterizer that are not the model's own, and whether they only move it.
 
     Those of ``render``, and of a relative by which training scripts draw in its place.
     """
-    for module in _renderers(repo):
+    for module in modules:
         functions = _drawing(repo, module)
         named = repo.mentions(_training(repo), [each.name for each in functions])
         others = [each for each in functions[1:] if each.name.startswith("render")]
@@ -379,10 +380,10 @@ def _of_drawing(repo: HostRepo) -> Iterator[tuple[str, bool]]:
 
 
 def _drawing(repo: HostRepo, module: str) -> list[ast.FunctionDef]:
-    """The functions of a module that draw, ``render`` first."""
+    """The functions of a module that draw, ``render`` first, then those that return a picture."""
     body = getattr(repo.tree(module), "body", ())
     found = [each for each in body if isinstance(each, ast.FunctionDef) and _call(each)]
-    return sorted(found, key=lambda each: each.name != "render")
+    return sorted(found, key=lambda each: (each.name != "render", not _pictures(each)))
 
 
 def _call(function: ast.AST, off: Collection[str] = ()) -> ast.Call | None:

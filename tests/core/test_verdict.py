@@ -367,6 +367,18 @@ def test_the_drawing_that_a_training_script_names_decides(fork, tmp_path):
     assert "render_all makes means3D from pc.net" in read_plain(HostRepo(tmp_path)).reasons[0]
 
 
+def test_the_drawing_that_returns_a_picture_decides(fork, tmp_path):
+    renamed = RENDER.replace("def render(", "def splat(")
+    counts = renamed.replace("splat", "count").replace('{"render": image}', "radii")
+    repo = fork((RENDER, counts.replace("pc.get_xyz", "pc.net(t)") + renamed))
+    assert read_plain(repo)
+
+
+def test_a_script_that_draws_by_itself_is_not_read_without_a_model(tmp_path):
+    (tmp_path / "train.py").write_text(RENDER.replace("pc.get_xyz", "pc.net(t)"))
+    assert judged(HostRepo(tmp_path)).reason == "no model of this family that saves a PLY was found"
+
+
 def test_of_several_folders_one_with_a_plain_ply_decides(fork, tmp_path):
     fork((".repeat(1, 3)", ".repeat(1, 2)"), root=tmp_path / "a_flat")
     assert judged(HostRepo(tmp_path)).reason.startswith("a_flat/: its Gaussians are flat")
