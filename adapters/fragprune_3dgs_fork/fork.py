@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from weakref import WeakKeyDictionary
@@ -151,7 +151,7 @@ class Fork:
     @cached_property
     def trees(self) -> dict[str, ast.Module]:
         """The scripts and the checkout's own modules that they import, without model and draws."""
-        seen = _imported(self.repo, map(_module, self.scripts))
+        seen = reading.reached(self.repo, map(_module, self.scripts), RENDERER)
         return {each: tree for each, tree in seen.items() if not _OF_MODELS.search(each)}
 
 
@@ -193,21 +193,6 @@ def _module(script: str) -> str:
     return script.removesuffix(".py").replace("/", ".")
 
 
-def _imported(repo: HostRepo, modules: Iterable[str]) -> dict[str, ast.Module]:
-    """Modules and those of the checkout that they import, without the renderer's."""
-    waiting, seen = [*modules], dict[str, ast.Module]()
-    while waiting:
-        module = waiting.pop(0)
-        tree = repo.tree(module)
-        if module in seen or tree is None or module.split(".")[0] == RENDERER:
-            continue
-        seen[module] = tree
-        for node in nodes(tree):
-            if isinstance(node, ast.Import | ast.ImportFrom):
-                waiting += repo.imported_by(module, node)
-    return seen
-
-
 # -- scripts ---------------------------------------------------------------------------------------
 
 
@@ -237,7 +222,7 @@ def _networks(repo: HostRepo, script: str) -> set[str]:
     """Classes that a script imports and that save no PLY: they are no models of Gaussians."""
     return {
         node.name
-        for tree in _imported(repo, [_module(script)]).values()
+        for tree in reading.reached(repo, [_module(script)], RENDERER).values()
         for node in tree.body
         if isinstance(node, ast.ClassDef)
         and node.name != CLASS

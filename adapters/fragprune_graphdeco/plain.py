@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from weakref import WeakKeyDictionary
@@ -41,11 +41,17 @@ _OF_CALL = re.compile(
     r"opacity|opacities|features|shs|rotations?|\w*sh\w*"
 )
 """Parameters of a drawing function that move or select Gaussians, or are their values."""
-_KEEPS = ("clamp", "clamp_", "contiguous", "squeeze", "unsqueeze", "to")
+_KEEPS = ("clamp", "clamp_", "contiguous", "squeeze", "unsqueeze", "to", "permute")
 """Methods that keep the numbers of a picture."""
 _PICTURES = re.compile(r"mesh_\w+|\w+_(rgb|colou?rs?)")
 """Arguments of a rasterizer that are pictures to blend with its own."""
+_GSPLAT = {
+    **{"means": "means3D", "quats": "rotations", "scales": "scales"},
+    **{"opacities": "opacities", "colors": "colors_precomp"},
+}
+"""Arguments of gsplat's ``rasterization`` in order, by their names in 3DGS."""
 _SAVES = re.compile(r"\.save_ply\(|scene\w*\.save\(")
+_ABSENT = "no model of this family that saves a PLY was found"
 _UNSAVED = "none of its scripts saves a PLY"
 
 
@@ -60,8 +66,10 @@ def read_models(repo: HostRepo) -> list[Plain]:
         model = read_plain(HostRepo(repo.root / each))
         reasons = tuple(why for why in model.reasons if not saved or why != _UNSAVED)
         models.append(replace(model, folder=each, reasons=reasons))
-    beside = not _renderers(repo) and any(each.model for each in models)
-    return [replace(own, model="") if beside else own, *models]
+    beside = not _own_renderers(repo) and any(each.model for each in models)
+    if beside:  # what was found by itself is that of a folder
+        own = Plain(own.reasons or (_ABSENT,))
+    return [own, *models]
 
 
 _known: WeakKeyDictionary[HostRepo, Plain] = WeakKeyDictionary()
@@ -77,9 +85,10 @@ def read_plain(repo: HostRepo) -> Plain:
 def _read_plain(repo: HostRepo) -> Plain:
     module, name = next(_models(repo), ("", ""))
     if not module:
-        return Plain((*(each for each, _ in _of_drawing(repo)), _without(repo)))
+        own = dict(_of_drawing(repo, _own_renderers(repo)))
+        return Plain((*own, _without(repo)))
     flat = list(_scales(repo, module, name))
-    moving = dict(_of_drawing(repo))
+    moving = dict(_of_drawing(repo, _renderers(repo)))
     drawn = list(moving)
     made = [each for each in drawn if "3D_filter" not in each]
     moving |= (getters := dict(_of_getters(repo, module, name)))
@@ -109,22 +118,37 @@ def _without(repo: HostRepo) -> str:
     paths = re.findall(r"^\s*path = (\S+)", repo.read(repo.root / ".gitmodules"), re.MULTILINE)
     absent = [each for each in paths if not any((repo.root / each).glob("*"))]
     beside = f"; its submodules are not in the checkout: {', '.join(absent)}" if absent else ""
-    return f"no model of this family that saves a PLY was found{beside}"
+    return f"{_ABSENT}{beside}"
 
 
 def _models(repo: HostRepo) -> Iterator[tuple[str, str]]:
-    """Module and class of each model in ``scene`` that saves a PLY, ``gaussian_model`` first."""
+    """Module and class of each model that saves a PLY, ``gaussian_model`` first: those in
+    ``scene``, or else those that a script trains.
+    """
     files = sorted(each.stem for each in (repo.root / "scene").glob("*.py"))
     order = ("gaussian", "model")
     files.sort(key=lambda stem: (*(word not in stem for word in order), len(stem)))
-    for stem in files:
-        tree = repo.tree(f"scene.{stem}") if stem.isidentifier() else None
-        classes = [each for each in (tree.body if tree else ()) if isinstance(each, ast.ClassDef)]
-        classes.sort(key=lambda each: each.name != "GaussianModel")
-        for each in classes:
-            saves = any(getattr(node, "name", "") == "save_ply" for node in each.body)
-            if saves and _columns(repo, f"scene.{stem}", each.name)[1]:
-                yield f"scene.{stem}", each.name
+    own = [f"scene.{each}" for each in files if each.isidentifier()]
+    found = [*_saving(repo, own, "save_ply")]
+    yield from found or _saving(repo, _trained(repo), "save_ply", "training_setup")
+
+
+def _saving(repo: HostRepo, modules: Iterable[str], *methods: str) -> Iterator[tuple[str, str]]:
+    """Module and name of each class with these methods that lists the columns of a PLY."""
+    for module in modules:
+        body = getattr(repo.tree(module), "body", ())
+        classes = [each for each in body if isinstance(each, ast.ClassDef)]
+        for each in sorted(classes, key=lambda each: each.name != "GaussianModel"):
+            own = {getattr(node, "name", "") for node in each.body}
+            if own.issuperset(methods) and _columns(repo, module, each.name)[1]:
+                yield module, each.name
+
+
+def _trained(repo: HostRepo) -> list[str]:
+    """The training scripts and what they import of a codebase."""
+    paths = [*sorted(repo.root.glob("*train*.py")), *sorted(repo.root.glob("*/*train*.py"))]
+    names = (path.relative_to(repo.root).with_suffix("").parts for path in paths)
+    return [*reading.reached(repo, map(".".join, names))]
 
 
 def _of_others(repo: HostRepo, module: str, model: str) -> Iterator[str]:
@@ -255,15 +279,11 @@ def _of_positions(repo: HostRepo, module: str, name: str) -> Iterator[str]:
 
 
 def _of_scripts(repo: HostRepo) -> Iterator[str]:
-    """A renderer that is not there, and scripts of which none saves a PLY."""
-    files = _scripts(repo)
-    if not _renderers(repo):
-        found = (each for each, text in files.items() if RASTERIZER in text)
-        other = next((f", but {each.relative_to(repo.root)}" for each in found), "")
-        yield f"what draws its PLY was not read: there is no gaussian_renderer{other}"
-    elif not any(_drawing(repo, module) for module in _renderers(repo)):
-        yield "what draws its PLY was not read: gaussian_renderer calls no rasterizer of 3DGS"
-    if any(repo.root.glob("*.py")) and not any(map(_SAVES.search, files.values())):
+    """No function that draws, and scripts of which none saves a PLY."""
+    if not any(_drawing(repo, module) for module in _renderers(repo)):
+        found = "no function was found that calls a rasterizer of 3DGS"
+        yield f"what draws its PLY was not read: {found}"
+    if any(repo.root.glob("*.py")) and not any(map(_SAVES.search, _scripts(repo).values())):
         yield _UNSAVED
     for script in _training(repo):
         yield from _of_sums(repo, script)
@@ -312,7 +332,7 @@ def _training(repo: HostRepo) -> list[str]:
 
 def _scripts(repo: HostRepo) -> dict[Path, str]:
     """The files of a codebase that may draw or save its model, with their text."""
-    paths = [*sorted(repo.root.glob("*.py")), *sorted(repo.root.glob("*/*.py"))]
+    paths = [path for each in ("", "*/", "*/*/") for path in sorted(repo.root.glob(f"{each}*.py"))]
     return {each: repo.read(each) for each in paths if each.parent.name != "scene"}
 
 
@@ -327,7 +347,14 @@ def _of_kernel(repo: HostRepo) -> Iterator[str]:
 
 
 def _renderers(repo: HostRepo) -> list[str]:
-    """Modules of the drawing functions."""
+    """Modules of the drawing functions: those of ``gaussian_renderer``, or else what training
+    scripts import.
+    """
+    return _own_renderers(repo) or [each for each in _trained(repo) if _drawing(repo, each)]
+
+
+def _own_renderers(repo: HostRepo) -> list[str]:
+    """The modules of ``gaussian_renderer``."""
     own = "gaussian_renderer"
     files = (each.stem for each in (repo.root / own).glob("*.py"))
     stems = sorted(files, key=lambda stem: (stem != "__init__", stem)) or ["__init__"] * (
@@ -336,12 +363,12 @@ def _renderers(repo: HostRepo) -> list[str]:
     return [own if each == "__init__" else f"{own}.{each}" for each in stems]
 
 
-def _of_drawing(repo: HostRepo) -> Iterator[tuple[str, bool]]:
+def _of_drawing(repo: HostRepo, modules: Iterable[str]) -> Iterator[tuple[str, bool]]:
     """Inputs of the rasterizer that are not the model's own, and whether they only move it.
 
     Those of ``render``, and of a relative by which training scripts draw in its place.
     """
-    for module in _renderers(repo):
+    for module in modules:
         functions = _drawing(repo, module)
         named = repo.mentions(_training(repo), [each.name for each in functions])
         others = [each for each in functions[1:] if each.name.startswith("render")]
@@ -353,22 +380,61 @@ def _of_drawing(repo: HostRepo) -> Iterator[tuple[str, bool]]:
 
 
 def _drawing(repo: HostRepo, module: str) -> list[ast.FunctionDef]:
-    """The functions of a module that draw, ``render`` first."""
+    """The functions of a module that draw, ``render`` first, then those that return a picture."""
     body = getattr(repo.tree(module), "body", ())
     found = [each for each in body if isinstance(each, ast.FunctionDef) and _call(each)]
-    return sorted(found, key=lambda each: each.name != "render")
+    return sorted(found, key=lambda each: (each.name != "render", not _pictures(each)))
 
 
 def _call(function: ast.AST, off: Collection[str] = ()) -> ast.Call | None:
-    """The first call that draws, one that needs no argument that is off if there is any."""
+    """The call that draws, of several one whose picture is returned, and that needs no argument
+    that is off.
+    """
     needy = [node for node in nodes(function) if isinstance(node, ast.If) and _needs(node, off)]
     behind = {id(inner) for node in needy for each in node.body for inner in nodes(each)}
     calls = [
         node
         for node in nodes(function)
-        if isinstance(node, ast.Call) and any(each.arg == "means3D" for each in node.keywords)
+        if isinstance(node, ast.Call) and "means3D" in _arguments(node)
     ]
-    return min(calls, key=lambda each: (id(each) in behind, each.lineno), default=None)
+    shown = _shown(function)
+    return min(
+        calls, key=lambda each: (each not in shown, id(each) in behind, each.lineno), default=None
+    )
+
+
+def _arguments(call: ast.AST | None) -> dict[str, ast.expr]:
+    """The arguments of a call, by their names in a rasterizer of 3DGS."""
+    if not isinstance(call, ast.Call):
+        return {}
+    given = {each.arg: each.value for each in call.keywords if each.arg}
+    if ast.unparse(call.func).split(".")[-1] != "rasterization":
+        return given
+    given |= dict(zip(_GSPLAT, call.args, strict=False))
+    return {_GSPLAT.get(name, name): value for name, value in given.items()}
+
+
+def _pictures(function: ast.AST) -> list[ast.expr]:
+    """What a function returns as ``render``."""
+    dicts = [node for node in nodes(function) if isinstance(node, ast.Dict)]
+    pairs = [pair for each in dicts for pair in zip(each.keys, each.values, strict=True)]
+    return [value for key, value in pairs if getattr(key, "value", "") == "render"]
+
+
+def _shown(function: ast.AST) -> list[ast.AST]:
+    """The code that makes what a function returns as ``render``."""
+    made: dict[str, list[ast.expr]] = {}
+    for node in nodes(function):
+        for target in node.targets if isinstance(node, ast.Assign) else ():
+            first = target.elts[0] if isinstance(target, ast.Tuple) else target
+            made.setdefault(getattr(first, "id", ""), []).append(node.value)  # type: ignore[attr-defined]
+    found: list[ast.AST] = [*_pictures(function)]
+    for each in found:  # it grows
+        if isinstance(each, ast.Name):
+            found += made.pop(each.id, [])
+        elif "means3D" not in _arguments(each):
+            found += ast.iter_child_nodes(each)
+    return found
 
 
 def _needs(node: ast.If, off: Collection[str]) -> bool:
@@ -503,7 +569,7 @@ class Drawing:
     def selection(self) -> str:
         """The code that picks rows of what is drawn first, as ``means3D[mask]``; "" without any."""
         call, own, seen = self.call, f"{self.model}.get_xyz", set()
-        waiting = [each.value for each in call.keywords if each.arg == "means3D"] if call else []
+        waiting = [value for name, value in _arguments(call).items() if name == "means3D"]
         while waiting:
             for node in ast.walk(waiting.pop()):
                 if isinstance(node, ast.Name) and node.id not in seen:
@@ -524,23 +590,21 @@ class Drawing:
             yield f"its picture is cut out of a tensor with further channels ({cut})", False
         yield from self.inputs()
         calls = read_calls(self.repo, self.module, self.function.name)
-        own = [each.arg for each in self.call.keywords if each.arg] if self.call else []
-        names = dict.fromkeys([*own, *(name for each in calls for name in each.given)])
+        names = dict.fromkeys([*_arguments(self.call), *(n for each in calls for n in each.given)])
         if pictures := [each for each in names if _PICTURES.fullmatch(each)]:
             yield f"its rasterizer also takes {', '.join(pictures)}", False
-        for node in nodes(self.function):
-            pairs = zip(node.keys, node.values, strict=True) if isinstance(node, ast.Dict) else ()
-            for key, value in pairs:
-                made = self._made_into(value) if getattr(key, "value", "") == "render" else None
-                if made is not None:
-                    at = self.repo.at(self.module, made.lineno)
-                    yield f"its picture is made into {ast.unparse(made)[:60]} ({at})", True
+        for made in filter(None, map(self._made_into, _pictures(self.function))):
+            at = self.repo.at(self.module, made.lineno)
+            yield f"its picture is made into {ast.unparse(made)[:60]} ({at})", True
 
     def _made_into(self, value: ast.expr, seen: tuple[str, ...] = ()) -> ast.expr | None:
         """The code that makes something else of the picture than its clamped numbers."""
         whole = value
         while isinstance(value, ast.Call) and _call(value) is None:
             method = value.func
+            if self._gives_back(getattr(method, "id", "")) and value.args:
+                value = value.args[0]
+                continue
             if not isinstance(method, ast.Attribute) or method.attr not in _KEEPS:
                 return whole
             value = value.args[0] if ast.unparse(method.value) == "torch" else method.value
@@ -552,32 +616,36 @@ class Drawing:
         made = (self._made_into(each, (*seen, name)) for each in others)
         return next((each for each in made if each is not None), None)
 
+    def _gives_back(self, name: str) -> bool:
+        """Whether a function returns first what its first argument is, or begins with."""
+        function = self.repo.function(self.module, name)
+        body = nodes(function)
+        kept = {each.arg for each in function.args.args[:1]} if function else set()
+        for node in (each for each in body if isinstance(each, ast.Assign)):
+            if getattr(node.value, "id", "") in kept and isinstance(node.targets[0], ast.Tuple):
+                kept |= {getattr(node.targets[0].elts[0], "id", "")}
+        given = [node.value for node in body if isinstance(node, ast.Return)]
+        first = [each.elts[0] if isinstance(each, ast.Tuple) else each for each in given]
+        return bool(first) and all(getattr(each, "id", "") in kept for each in first)
+
     def inputs(self) -> Iterator[tuple[str, bool]]:
-        """Inputs of the first call that a plain drawing does not have, and whether arguments of
+        """Inputs of its call that a plain drawing does not have, and whether arguments of
         the function make them from the model's own.
         """
-        call = self.call
-        given = {each.arg: each.value for each in call.keywords if each.arg} if call else {}
+        given = _arguments(self.call)
         at = self.repo.at(self.module, self.function.lineno)
-        for argument in ("means3D", "opacities", "scales", "rotations"):
+        own = {"means3D": "get_xyz", "scales": "get_scaling", "rotations": "get_rotation"}
+        for argument in ("means3D", "opacities", "scales", "rotations", "shs"):
             roots = list(self._roots(given[argument])) if argument in given else []
             others = [each for each in dict.fromkeys(roots) if not self._plain(each)]
             if others:
                 shown = ", ".join(others[:4])
                 what = f"makes {argument} from {shown}, not from its PLY alone"
-                own = {"means3D": "get_xyz", "scales": "get_scaling", "rotations": "get_rotation"}
+                if argument == "shs":
+                    what = f"makes colours from {shown}"
                 kept = f"{self.model}.{own.get(argument)}" in roots
                 yield f"{self.function.name} {what} ({at})", kept and self._beside(others)
-        if "shs" in given:
-            roots = [*self._roots(given["shs"])]
-            if not roots and "colors_precomp" in given:
-                made = dict.fromkeys(self._roots(given["colors_precomp"]))
-                yield f"{self.function.name} makes colours from {', '.join(made)} ({at})", False
-            others = [each for each in dict.fromkeys(roots) if not self._plain(each)]
-            if others:
-                shown = ", ".join(others[:4])
-                yield f"{self.function.name} makes colours from {shown} ({at})", False
-            yield from self._of_colours(given)
+        yield from self._of_colours(given)
 
     def _of_colours(self, given: Mapping[str, ast.expr]) -> Iterator[tuple[str, bool]]:
         """Colours that are no spherical harmonics of the model's features."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 
 from fragprune_plugins.adapting import (
     CommandLine,
@@ -178,6 +178,21 @@ def training_scripts(repo: HostRepo, *patterns: str) -> tuple[str, ...]:
         if found := [k for k, name in parts.items() if len(repo.mentions([name], wanted)) > 1]:
             return tuple(found)
     return ()
+
+
+def reached(repo: HostRepo, modules: Iterable[str], without: str = "") -> dict[str, ast.Module]:
+    """Modules and those of the checkout that they import, without one and what it imports."""
+    waiting, seen = [*modules], dict[str, ast.Module]()
+    while waiting:
+        module = waiting.pop(0)
+        tree = repo.tree(module)
+        if module in seen or tree is None or module.split(".")[0] == without:
+            continue
+        seen[module] = tree
+        for node in nodes(tree):
+            if isinstance(node, ast.Import | ast.ImportFrom):
+                waiting += repo.imported_by(module, node)
+    return seen
 
 
 def defaults(repo: HostRepo, module: str, name: str) -> Iterator[ast.expr]:

@@ -63,6 +63,7 @@ def render(viewpoint_camera, pc, pipe, bg_color, training=False, override_color=
     image, radii, depth, used = rasterizer(
         means3D=means3D, opacities=opacity, shs=shs, scales=scales, rotations=rotations
     )
+    return {"render": image}
 """
 GROWS = """
     def grow(self, points):
@@ -79,6 +80,38 @@ CLAMPED = """rotations=rotations
         image = image * pc.exposure
     image = torch.clamp(image, 0, 1) + (1 - alpha) * bg_color
     return {"render": image.contiguous()}
+"""
+
+SHADOW = """    with torch.no_grad():
+        _, shadow, _, _ = rasterizer(
+            means3D=pc.get_xyz, opacities=pc.net(light), shs=None, colors_precomp=black
+        )
+    means3D = pc.get_xyz
+"""
+END = """rotations=rotations
+    )
+    return {"render": image}
+"""
+GSPLAT = """rotations=rotations
+    )
+    drawn, alpha, more = gsplat.rasterization(
+        means3D, quats=rotations, scales=scales, opacities=opacity.squeeze(-1), colors={}
+    )
+    return {{"render": drawn[0].permute(2, 0, 1)}}
+"""
+CHOSEN = """rotations=rotations
+    )
+    raw = rasterizer(means3D=means3D, opacities=opacity, shs=shs)
+    image, more = chosen(raw)
+    return {"render": image}
+
+
+def chosen(given):
+    if len(given) == 2:
+        first, second = given
+        return first, second
+    first, *others = given
+    return first{}, others
 """
 
 
@@ -170,7 +203,7 @@ def test_the_nearest_host_is_of_this_family(fork):
         ("return torch.cat((", "return self.net((", "get_features is computed"),
         ("shs=shs, scales", "dc=shs, shs=pc.net(view), scales", "colours from pc.net"),
         ("= self._opacity.detach()", "= self.get_opacity_now.detach()", "stores other values"),
-        ("means3D=means3D, ", "means=means3D, ", "gaussian_renderer calls no rasterizer"),
+        ("means3D=means3D, ", "means=means3D, ", "no function was found that calls"),
         ('"opacity"]', '"opacity", "binding_0"]', "binding, positions relative to the triangles"),
         ('names.append("f_dc_{}".format(i))', "...", "lacks the columns f_dc"),
         (".repeat(1, 3)", ".repeat(1, 2)", "flat, with two scales"),
@@ -208,6 +241,8 @@ def test_the_nearest_host_is_of_this_family(fork):
             )
             for k in ("made[seen]", "self._scaling_quantised")
         ),
+        (END, GSPLAT.format("pc.net(x)"), "colours from pc.net"),
+        (END, CHOSEN.replace("{}", " / 2"), "is made into chosen(raw)"),
         ("rotations=rotations\n    )\n", MEAN, "its picture is made into image.mean(dim=0)"),
         ("shs=shs, scales", "mesh_color=mesh, shs=shs, scales", "rasterizer also takes mesh_color"),
         ("{'params': [], 'name': 'f_dc'}", "{'params': [self._opacity]}", "not train positions"),
@@ -248,6 +283,9 @@ def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):
             f"class GaussianModel2D:{GROWS}(self): ...\n\n\nclass GaussianModel:",
         ),
         ("\n    means3D = pc.get_xyz\n", BOXED),
+        ("    means3D = pc.get_xyz\n", SHADOW),
+        (END, GSPLAT.format("shs")),
+        (END, CHOSEN.replace("{}", "")),
         (".repeat(1, 3)", "\n        scales = scales if self.round else scales.repeat(1, 3)"),
     ],
 )
@@ -270,10 +308,29 @@ def test_what_is_never_saved_or_drawn_is_not_plain(fork, tmp_path):
     script = tmp_path / "train.py"
     script.write_text(script.read_text().replace("scene.save(", "scene.show("))
     assert "none of its scripts saves a PLY" in read_plain(repo).reasons
-    renderer = tmp_path / "gaussian_renderer/__init__.py"
-    renderer.rename(tmp_path / "drawing.py")
+    (tmp_path / "gaussian_renderer/__init__.py").unlink()
     found = read_plain(HostRepo(tmp_path)).reasons[0]
-    assert found.endswith("there is no gaussian_renderer, but drawing.py")
+    assert found.endswith("not read: no function was found that calls a rasterizer of 3DGS")
+
+
+@pytest.mark.parametrize(
+    ("drawn", "kind", "reason"),
+    [("pc.get_xyz", "finetune", ""), ("pc.net(t)", "never", "render makes means3D from pc.net")],
+)
+def test_model_and_drawing_are_found_in_any_package(fork, tmp_path, drawn, kind, reason):
+    fork(("means3D = pc.get_xyz", f"means3D = {drawn}"))
+    package = tmp_path / "splats/parts"
+    package.mkdir(parents=True)
+    (tmp_path / "scene/gaussian_model.py").rename(package / "model.py")
+    (tmp_path / "gaussian_renderer/__init__.py").rename(package / "draw.py")
+    (tmp_path / "gaussian_renderer").rmdir()
+    (package / "unused.py").write_text(RENDER.replace("pc.get_xyz", "pc.other(t)"))
+    script = tmp_path / "train.py"
+    trains = script.read_text().replace("from gaussian_renderer", "from splats.parts.draw")
+    script.write_text(f"import splats.parts.model\n{trains}")
+    verdict = judged(HostRepo(tmp_path))
+    assert verdict.kind == kind
+    assert reason in verdict.reason
 
 
 @pytest.mark.parametrize(
@@ -308,6 +365,18 @@ def test_the_drawing_that_a_training_script_names_decides(fork, tmp_path):
     assert read_plain(HostRepo(tmp_path))
     script.write_text(script.read_text().replace("import render\n", "import render_all\n"))
     assert "render_all makes means3D from pc.net" in read_plain(HostRepo(tmp_path)).reasons[0]
+
+
+def test_the_drawing_that_returns_a_picture_decides(fork, tmp_path):
+    renamed = RENDER.replace("def render(", "def splat(")
+    counts = renamed.replace("splat", "count").replace('{"render": image}', "radii")
+    repo = fork((RENDER, counts.replace("pc.get_xyz", "pc.net(t)") + renamed))
+    assert read_plain(repo)
+
+
+def test_a_script_that_draws_by_itself_is_not_read_without_a_model(tmp_path):
+    (tmp_path / "train.py").write_text(RENDER.replace("pc.get_xyz", "pc.net(t)"))
+    assert judged(HostRepo(tmp_path)).reason == "no model of this family that saves a PLY was found"
 
 
 def test_of_several_folders_one_with_a_plain_ply_decides(fork, tmp_path):
@@ -392,6 +461,14 @@ def test_a_folder_that_fits_is_named_at_the_root(tmp_path, folder):
     assert verdict.kind == "inside"
     assert verdict.inside == ((folder, "vanilla-3dgs"),)
     assert f"fragprune check {tmp_path / folder}" in verdict.sentence
+
+
+def test_a_folder_that_fits_is_named_beside_one_that_a_script_above_trains(fork, tmp_path):
+    fork(root=tmp_path / "inner")
+    skeleton(tmp_path / "other")
+    modules = "inner.gaussian_renderer, inner.scene.gaussian_model"
+    (tmp_path / "train.py").write_text(f"import {modules}\nscene.save(3)\n")
+    assert judged(HostRepo(tmp_path)).inside == (("other", "vanilla-3dgs"),)
 
 
 def test_a_picture_cut_out_of_further_channels_is_not_the_plys(fork):
