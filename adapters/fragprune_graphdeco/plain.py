@@ -50,6 +50,8 @@ _GSPLAT = {
     **{"opacities": "opacities", "colors": "colors_precomp"},
 }
 """Arguments of gsplat's ``rasterization`` in order, by their names in 3DGS."""
+_USUAL = {"rasterize_mode": "classic", "camera_model": "pinhole", "eps2d": 0.3}
+"""Arguments of it that change the picture, and the values with which it draws as 3DGS does."""
 _SAVES = re.compile(r"\.save_ply\(|scene\w*\.save\(")
 _ABSENT = "no model of this family that saves a PLY was found"
 _UNSAVED = "none of its scripts saves a PLY"
@@ -645,6 +647,10 @@ class Drawing:
                     what = f"makes colours from {shown}"
                 kept = f"{self.model}.{own.get(argument)}" in roots
                 yield f"{self.function.name} {what} ({at})", kept and self._beside(others)
+        for name, usual in _USUAL.items():
+            if name in given and getattr(given[name], "value", None) != usual:
+                how = f"{name}={ast.unparse(given[name])}, not {usual!r}"
+                yield f"{self.function.name} draws with {how} ({at})", False
         yield from self._of_colours(given)
 
     def _of_colours(self, given: Mapping[str, ast.expr]) -> Iterator[tuple[str, bool]]:

@@ -242,6 +242,12 @@ def test_the_nearest_host_is_of_this_family(fork):
             for k in ("made[seen]", "self._scaling_quantised")
         ),
         (END, GSPLAT.format("pc.net(x)"), "colours from pc.net"),
+        (
+            END,
+            GSPLAT.format("shs, rasterize_mode='antialiased'"),
+            "render draws with rasterize_mode='antialiased', not 'classic'",
+        ),
+        (END, GSPLAT.format("shs, eps2d=0.0"), "render draws with eps2d=0.0, not 0.3"),
         (END, CHOSEN.replace("{}", " / 2"), "is made into chosen(raw)"),
         ("rotations=rotations\n    )\n", MEAN, "its picture is made into image.mean(dim=0)"),
         ("shs=shs, scales", "mesh_color=mesh, shs=shs, scales", "rasterizer also takes mesh_color"),
@@ -285,6 +291,7 @@ def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):
         ("\n    means3D = pc.get_xyz\n", BOXED),
         ("    means3D = pc.get_xyz\n", SHADOW),
         (END, GSPLAT.format("shs")),
+        (END, GSPLAT.format("shs, rasterize_mode='classic', packed=False")),
         (END, CHOSEN.replace("{}", "")),
         (".repeat(1, 3)", "\n        scales = scales if self.round else scales.repeat(1, 3)"),
     ],
