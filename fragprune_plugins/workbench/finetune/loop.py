@@ -176,12 +176,11 @@ class Training:
         ):
             for shots in islice(steps, self.done, None):
                 self.between = False
-                due = keeper.due(self.done + 1)
-                self._step(shots, waiting, due)
+                self._step(shots, waiting, keeper)
                 self.between = True
                 if self.processes.may_end:
                     waiting()
-                if self.processes.keeps(due):
+                if self.processes.keeps(keeper.due(self.done)):
                     keeper.keep(self)
                 bar.update()
                 if self.curves and self.done % max(1, total // _POSTFIXES) == 0:
@@ -211,7 +210,7 @@ class Training:
         """All that learns, by name."""
         return {**self.parameters(), "thresholds": self.stage.store.logits}
 
-    def _step(self, shots: Sequence[Shot], waiting: Waiting, due: bool) -> None:
+    def _step(self, shots: Sequence[Shot], waiting: Waiting, keeper: Keeping) -> None:
         stage = self.stage
         stage.begin(lambda: torch.sigmoid(self.model.opacity.detach()))
         self._plain_first = not all(map(stage.knows, shots))
@@ -222,6 +221,7 @@ class Training:
             stage.lost(loss)
             torch.autograd.backward(loss if pressure is None else loss + pressure)
         stage.picture = ", ".join(shot.name for shot in shots)
+        due = keeper.due(self.done + 1)
         self.processes.went_backward(stage, self._learned(), shots, waiting, due=due)
         rates = self.rates.items()
         for group, (name, base) in zip(self.optimizer.param_groups, rates, strict=True):
