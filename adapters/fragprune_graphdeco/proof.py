@@ -34,8 +34,8 @@ OF_A_VIEW = frozenset(
         *("campos", "bg", "timestamp", "sh_degree", "prefiltered", "debug"),
     }
 )
-"""Settings that may change from view to view. A proof covers every SH degree and background;
-another value of any other setting needs another proof."""
+"""Settings that may change from view to view. A proof covers every SH degree, and black or every
+other background; another value of any other setting needs another proof."""
 
 _DETACHED = ", without gradient"
 
@@ -55,7 +55,10 @@ class RasterizerProver(Prover):
         """Which arguments a call has, and every rule that it sets."""
         settings = call.settings._asdict() if hasattr(call.settings, "_asdict") else {}
         for name, value in settings.items():
-            if name not in OF_A_VIEW:
+            if name == "bg":
+                black = isinstance(value, Tensor) and not value.any()  # it may be left out
+                yield name, "black" if black else "lit"
+            elif name not in OF_A_VIEW:
                 yield name, _rule(value)
         for name, value in call.arguments.items():
             if isinstance(value, Tensor) and name in (*ARGUMENTS, "dc"):

@@ -123,7 +123,7 @@ def test_the_gradient_on_the_screen_matters_only_where_ours_draws_for_densificat
 
 
 def test_every_difference_is_tried():
-    assert {*EQUAL, *OTHERWISE, "scale modifier"} == DIFFERENCES.keys()
+    assert {*EQUAL, *OTHERWISE, "scale modifier", "no background"} == DIFFERENCES.keys()
 
 
 def test_an_unknown_output_that_nobody_reads_is_let_be(host):
@@ -188,7 +188,7 @@ def test_a_setting_with_another_value_is_proved_again(host, caplog):
         draw(session.camera(64, 48, side=0.1), model, pipe, torch.ones(3))
         model.active_sh_degree = 0
         draw(camera, model, pipe, black)
-        assert len(session.session.proofs) == 1  # views, backgrounds and bands need no other
+        assert len(session.session.proofs) == 2  # views and bands need no other than black and lit
         with pytest.raises(ProofError, match="another picture"):
             draw(camera, model, pipe, black, 1.5)
     with running(folder) as session:  # the host's own stage: stage 2 would refuse it
@@ -197,6 +197,15 @@ def test_a_setting_with_another_value_is_proved_again(host, caplog):
         draw(camera, model, pipe, black)
         draw(camera, model, pipe, black, 1.5)
     assert "another picture" in caplog.text
+
+
+def test_a_background_that_lights_is_proved_by_itself(host):
+    with running(host("no background"), learn=True) as session:
+        model, camera = session.model(40), session.camera(96, 64)
+        draw = import_module("gaussian_renderer").render
+        draw(camera, model, session.driver.pipe(), torch.zeros(3))
+        with pytest.raises(ProofError, match="another picture"):
+            draw(camera, model, session.driver.pipe(), torch.ones(3))
 
 
 def antialiased(folder):

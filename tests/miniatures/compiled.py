@@ -43,6 +43,7 @@ class Difference:
         radii: divides them.
         also: further outputs, of a rendering whose feature is the view depth.
         weighed: a further output, of the weights (N, H, W) of all Gaussians, and of these.
+        lit: whether the background shines through.
     """
 
     options: dict[str, Any] | None = None
@@ -51,6 +52,7 @@ class Difference:
     radii: int = 1
     also: tuple[Callable[[Rendering], Tensor], ...] = ()
     weighed: Callable[[Tensor, Gaussians, Camera], Tensor] | None = None
+    lit: bool = True
 
 
 def straight(camera: Camera, points: Tensor) -> Tensor:
@@ -129,6 +131,7 @@ DIFFERENCES = {
         backward={"opacities": lambda grad, own: grad * own * (1 - own)}
     ),
     "half the radii": Difference(radii=2),
+    "no background": Difference(lit=False),
     "depth": Difference(also=(lambda drawn: drawn.features,)),
     "depth without gradient": Difference(also=(lambda drawn: drawn.features.detach(),)),
     "depth over alpha": Difference(
@@ -184,7 +187,7 @@ class Rasterizer(nn.Module):
             viewmatrix=s.viewmatrix,
             projmatrix=s.projmatrix,
             campos=s.campos,
-            background=s.bg,
+            background=s.bg if other.lit else torch.zeros(3),
         )
         means = given["means3D"]
         gaussians = Gaussians(
