@@ -64,7 +64,7 @@ class Observation:
 
 @dataclass
 class PressureRule:
-    """Gives lambda for the next step: ``value``, the same in all steps if it is no other rule."""
+    """Gives lambda for the next step: ``value``, which only other rules change."""
 
     value: float
 

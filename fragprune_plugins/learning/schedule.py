@@ -124,7 +124,8 @@ class Settings:
         """
         own = _ELASTICITY_OF_ALL if self.train == "all" else ELASTICITY
         rule = self.goal.pressure(own if elasticity is None else elasticity, self.itself)
-        if isinstance(rule, ElasticPressure) and self.dropout and self.warmup:
+        after_dropout = elasticity is None and self.dropout and self.warmup
+        if isinstance(rule, ElasticPressure) and after_dropout:
             rule.value = rule.least = _LEAST_AFTER_DROPOUT
         return rule
 

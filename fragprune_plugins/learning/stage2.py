@@ -173,7 +173,8 @@ class Stage2:
                 known = opacities()
                 self._expect_no_reset(known)
                 self.store.open(known)
-            self._meet_target(self.plan.progress)
+            if self.target is not None:
+                self._meet_target(self.target, self.plan.progress)
         return self.plan
 
     def _expect_no_reset(self, opacities: Tensor) -> None:
@@ -419,12 +420,12 @@ class Stage2:
         put(self._views, {"expected": plain["expected"]})
         put(self.pressure, plain["pressure"])
 
-    def _meet_target(self, progress: float) -> None:
+    def _meet_target(self, target: Target, progress: float) -> None:
         """Late in the run, and again before its last step, shift all thresholds onto the target."""
-        target, known = self.target, dict.fromkeys(view for view, _ in self._before)
+        known = dict.fromkeys(view for view, _ in self._before)
         views = evenly([view for view in known if view in self._again], CALIBRATION_VIEWS)
         due = progress >= 1.0 or (progress >= CALIBRATE_AT and not self._held)
-        if target is None or not views or (self._held and not due):
+        if not views or (self._held and not due):
             return
 
         @torch.no_grad()

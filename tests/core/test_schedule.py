@@ -177,9 +177,11 @@ def test_a_warm_up_with_dropout_bears_more_pressure(settings, least):
     assert pressure.value == least
 
 
-def test_a_pressure_that_is_given_is_not_changed_by_dropout():
+def test_dropout_changes_no_pressure_that_is_given_nor_that_of_a_training():
     given = Settings(5000, dropout=0.2, goal=Pressure(1e-4)).make_pressure()
     assert given == PressureRule(1e-4)
+    joint = JointSchedule(Settings(5000, dropout=0.2), 1).make_pressure()
+    assert joint.value == LEAST_PRESSURE
 
 
 def test_a_fixed_pressure_stays():

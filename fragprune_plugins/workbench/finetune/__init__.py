@@ -12,11 +12,8 @@ from fragprune_plugins.workbench.commands.command import (
     first_process_prints,
     work_of,
 )
-from fragprune_plugins.workbench.commands.learning import (
-    LEARNING_APART,
-    config_option,
-    learning_options,
-)
+from fragprune_plugins.workbench.commands.config import config_option
+from fragprune_plugins.workbench.commands.learning import LEARNING_APART, learning_options
 from fragprune_plugins.workbench.commands.logs import log_option
 from fragprune_plugins.workbench.commands.options import (
     FILE,

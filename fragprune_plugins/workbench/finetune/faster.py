@@ -6,7 +6,6 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any, ClassVar
 
 import torch
@@ -160,7 +159,7 @@ def require_reach(target: float, model: Model, shots: Sequence[Shot], engine: En
 
     before = drawn(None)
     calibrate(store, lambda: before / max(drawn(store.values), 1e-9), FEWEST, tolerance=0.1)
-    limit = times_faster(plain, replace(plain, cut=store.values), some, engine)
+    limit = times_faster(plain, plain.sharing(cut=store.values), some, engine)
     if target >= limit:
         size = f"{shots[0].view.width}x{shots[0].view.height}"
         raise UsageError(

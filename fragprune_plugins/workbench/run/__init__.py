@@ -7,11 +7,8 @@ from typing import Any
 import click
 
 from fragprune_plugins.workbench.commands.command import Command, Report, work_of
-from fragprune_plugins.workbench.commands.learning import (
-    LEARNING_APART,
-    config_option,
-    learning_options,
-)
+from fragprune_plugins.workbench.commands.config import config_option
+from fragprune_plugins.workbench.commands.learning import LEARNING_APART, learning_options
 from fragprune_plugins.workbench.commands.logs import log_option
 from fragprune_plugins.workbench.commands.options import engine_options
 from fragprune_plugins.workbench.commands.rules import Needs
