@@ -114,9 +114,11 @@ def _read_plain(repo: HostRepo) -> Plain:
 
 def _without(repo: HostRepo) -> str:
     """Why no model was found that saves a PLY."""
-    if repo.function("scene.gaussian_model", "GaussianModel.__init__"):
-        at = repo.place("scene.gaussian_model", "GaussianModel")
-        return f"its GaussianModel has no save_ply ({at})"
+    module = "scene.gaussian_model"
+    if repo.path(module) and repo.tree(module) is None:
+        return "its scene/gaussian_model.py is no valid Python"
+    if repo.function(module, "GaussianModel.__init__"):
+        return f"its GaussianModel has no save_ply ({repo.place(module, 'GaussianModel')})"
     paths = re.findall(r"^\s*path = (\S+)", repo.read(repo.root / ".gitmodules"), re.MULTILINE)
     absent = [each for each in paths if not any((repo.root / each).glob("*"))]
     beside = f"; its submodules are not in the checkout: {', '.join(absent)}" if absent else ""

@@ -386,6 +386,13 @@ def test_a_script_that_draws_by_itself_is_not_read_without_a_model(tmp_path):
     assert judged(HostRepo(tmp_path)).reason == "no model of this family that saves a PLY was found"
 
 
+def test_a_model_that_is_no_python_is_said_to_be(tmp_path):
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "gaussian_model.py").write_text("<<<<<<< HEAD\n")
+    reason = judged(HostRepo(tmp_path)).reason
+    assert reason == "its scene/gaussian_model.py is no valid Python"
+
+
 def test_of_several_folders_one_with_a_plain_ply_decides(fork, tmp_path):
     fork((".repeat(1, 3)", ".repeat(1, 2)"), root=tmp_path / "a_flat")
     assert judged(HostRepo(tmp_path)).reason.startswith("a_flat/: its Gaussians are flat")
