@@ -132,8 +132,7 @@ def measure_all(
         The figures of each, as those of ``measure``.
     """
     device = candidates[0].model.device
-    if isinstance(engine, str):
-        engine = engine_for(engine, device)
+    engine = engine_for(engine, device)
     shots = [shot.to(device) for shot in shots]
     reports: list[dict[str, Any]] = []
     for candidate in candidates:

@@ -97,14 +97,6 @@ class Processes:
                 "Change --views-per-step.",
             )
 
-    def agree(self, known: dict[str, Any]) -> None:
-        """Raise RanksError if another process is about to learn something else."""
-        self.ranks.agree(known, "fine-tuning, before its first step")
-
-    def share(self, shots: Sequence[Shot]) -> Sequence[Shot]:
-        """The views of a step that this process draws."""
-        return self.ranks.share(shots)
-
     @torch.no_grad()
     def went_backward(
         self,

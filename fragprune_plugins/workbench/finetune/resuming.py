@@ -123,18 +123,13 @@ class Keeper:
         self.checkpoints = checkpoints if processes.first else None
         if checkpoints is None and not processes.several:
             return
-        stage = training.stage
-        asked = configuration(
-            training.start,
-            training.dataset,
-            training.settings,
-            training.engine.name,
-            stage.schedule,
-        )
+        given = training.start, training.dataset, training.settings, training.engine.name
+        asked = configuration(*given, training.stage.schedule)
         self.asked = processes.described(asked) | {"loss": code_for(training.start.device)}
         if checkpoints is not None:
             self._go_on(checkpoints, training)
-        processes.agree({**self.asked, "checkpoint": training.done, "torch": torch.__version__})
+        known = {**self.asked, "checkpoint": training.done, "torch": torch.__version__}
+        processes.ranks.agree(known, "fine-tuning, before its first step")
 
     def _go_on(self, checkpoints: Checkpoints, training: Training) -> None:
         """Take over what a checkpoint holds, if there is one."""

@@ -106,8 +106,7 @@ def _open(asked: Asked) -> _Opened:
         dataset = load_photographs(photographs)
     checkpoints = Checkpoints(resuming.path_beside(asked.out), resuming.EVERY, tell=_say)
     configuration = resuming.configuration(whole, dataset, settings, engine.name)
-    configuration |= {"keep": asked.keep}
-    configuration |= {"sharded": True} if asked.shard else {}
+    configuration |= {"keep": asked.keep} | ({"sharded": True} if asked.shard else {})
     return _Opened(asked, whole, photographs, dataset, engine, device, checkpoints, configuration)
 
 

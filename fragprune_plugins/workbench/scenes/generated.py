@@ -289,7 +289,7 @@ def own_pictures(
 
 def _drawing(model: Model, engine: str | Engine) -> Callable[[View], Tensor]:
     """Draws a model as it is now, (3, H, W)."""
-    drawer = engine_for(engine, model.device) if isinstance(engine, str) else engine
+    drawer = engine_for(engine, model.device)
     splats, thresholds = model.splats(), model.falloff
 
     @torch.no_grad()
