@@ -8,7 +8,7 @@ import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -19,6 +19,10 @@ from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View, o
 from fragprune_plugins.workbench.figures.clock import standard_error, synchronize, timed
 
 Pass = Literal["forward", "forward_backward"]
+PASSES: tuple[Pass, ...] = get_args(Pass)
+
+TRUNCATION = 16 / 255
+"""Threshold of all Gaussians in truncated rows; leaves 0.63 of the fragments, as learning does."""
 
 
 @dataclass(frozen=True)

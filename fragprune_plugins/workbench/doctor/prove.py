@@ -35,8 +35,9 @@ from fragprune_plugins.slicing.cutting import expect_right
 from fragprune_plugins.types import RasterInputs, Splats, one_line
 from fragprune_plugins.workbench.bench.scene import make_scene, make_view
 from fragprune_plugins.workbench.bench.timing import (
+    PASSES,
+    TRUNCATION,
     Case,
-    Pass,
     describe_machine,
     load_average,
     measure,
@@ -59,7 +60,6 @@ SCENES = {
 """Gaussians and size of the timed pictures, by the kind of device."""
 
 _NOT_EMULATED = "no C++17 compiler on Linux: install g++, or name one with CXX, and prove again"
-_KINDS: tuple[Pass, ...] = ("forward", "forward_backward")
 _CLOCKS = ("driver_version", "clocks.sm", "clocks.max.sm", "clocks.mem", "temperature.gpu")
 
 
@@ -134,9 +134,6 @@ def _ours(kind: str) -> Iterator[Contestant]:
         yield Contestant("cuda", CudaEngine())
 
 
-# ---- correctness ---------------------------------------------------------------------------------
-
-
 def _check(contestant: Contestant, kind: str) -> dict[str, Any]:
     """Every difference from the oracle in float64; empty if there is none."""
     where = "cpu" if isinstance(contestant.engine, CpuEngine) else kind
@@ -144,11 +141,10 @@ def _check(contestant: Contestant, kind: str) -> dict[str, Any]:
     if not contestant.ours:
         return found | {"differences": list(peer_differences(contestant.engine, where))}
     rows = [held(contestant.engine, where, scene) for scene in scenes()]
-    return found | {"differences": _differences(rows), "scenes": rows}
-
-
-def _differences(rows: Sequence[dict[str, Any]]) -> list[str]:
-    return [each for row in rows for each in row["differences"]]
+    return found | {
+        "differences": [each for row in rows for each in row["differences"]],
+        "scenes": rows,
+    }
 
 
 def _emulation(say: Callable[[str], None]) -> dict[str, Any]:
@@ -164,21 +160,14 @@ def _emulation(say: Callable[[str], None]) -> dict[str, Any]:
         for scene in scenes():
             say(f"emulating the cuda kernels: {scene.name}")
             rows.append(held(engine, "cpu", scene))
-        differences = _differences(rows)
+        differences = [each for row in rows for each in row["differences"]]
         say("emulating the cuda kernels: a cut in time")
         try:
             expect_right(device, torch.device("cpu"))
         except (FragpruneError, RuntimeError) as error:
             differences.append(f"a cut in time: {str(error).splitlines()[0]}")
-    return {
-        "compiler": version_of(compiler),
-        "not_proved": None,
-        "differences": differences,
-        "scenes": rows,
-    }
-
-
-# ---- time ----------------------------------------------------------------------------------------
+    proved = {"compiler": version_of(compiler), "not_proved": None}
+    return proved | {"differences": differences, "scenes": rows}
 
 
 def _times(
@@ -192,7 +181,7 @@ def _times(
         cut = torch.full_like(splats.opacities, TRUNCATION)
         cases = [
             Case(f"bench-{count}", view, splats, way, thresholds)
-            for way in _KINDS
+            for way in PASSES
             for thresholds in (None, cut)
         ]
         plain = [case for case in cases if case.thresholds is None]
@@ -214,9 +203,6 @@ def _finite(row: dict[str, Any]) -> dict[str, Any]:
         key: None if isinstance(each, float) and math.isnan(each) else each
         for key, each in row.items()
     }
-
-
-# ---- what is printed -----------------------------------------------------------------------------
 
 
 def _hashes() -> dict[str, str]:
@@ -291,9 +277,6 @@ def _table(rows: Sequence[dict[str, Any]]) -> str:
         )
     return "\n".join(lines)
 
-
-TRUNCATION = 16 / 255
-"""One threshold for all Gaussians of the timed scene."""
 
 MISCOUNTED = 1 / 500
 """The share of pixels whose fragments may be counted otherwise.
