@@ -34,6 +34,7 @@ from fragprune_plugins.workbench.figures.extents import (
     VIEWERS,
     covered,
     honouring,
+    quads,
     shaded,
 )
 from fragprune_plugins.workbench.figures.metrics import psnr
@@ -264,12 +265,9 @@ class _Survey:
             out = candidate.draw(engine, view, counts=itself is None)
             itself = out if itself is None else itself
             error = (out.image.clamp(0, 1) - itself.image.clamp(0, 1)).square().mean()
-            row = {
-                "mse": float(error),
-                "psnr": psnr(out.image, itself.image),
-            }
-            row |= {key: float(getattr(out, key)) for key in _COUNTS}
-            self._rows[label].append(row)
+            counts = {key: float(getattr(out, key)) for key in _COUNTS}
+            psnr_itself = psnr(out.image, itself.image)
+            self._rows[label].append({"mse": float(error), "psnr": psnr_itself, **counts})
         assert itself is not None
         self._radii = itself.radii
         inputs = self._itself.inputs(view)
@@ -281,8 +279,7 @@ class _Survey:
         cut = self._itself.thresholds(inputs)
         if cut is not None:
             reach = honouring(cut, opacities)
-            quads = 4 / math.pi * float(covered(engine, inputs, reach).fragments_per_pixel)
-            self._asked.setdefault(HONOURING, []).append(quads)
+            self._asked.setdefault(HONOURING, []).append(quads(engine, inputs, reach))
         if shown:
             assert itself.fragments is not None
             assert ellipses.fragments is not None

@@ -156,17 +156,10 @@ class Training:
         """All steps that are not done yet."""
         settings, total = self.settings, self.settings.iterations
         steps = order(self.dataset.train, total, settings.views_per_step, settings.seed)
-        with (
-            tqdm(
-                total=total,
-                initial=self.done,
-                disable=not progress,
-                desc="fine-tuning",
-                unit="it",
-                leave=None,
-            ) as bar,
-            between_steps() as waiting,
-        ):
+        bar = tqdm(
+            desc="fine-tuning", total=total, initial=self.done, leave=None, disable=not progress
+        )
+        with bar, between_steps() as waiting:
             for shots in islice(steps, self.done, None):
                 self.between = False
                 self._step(shots, waiting, keeper)
@@ -181,7 +174,7 @@ class Training:
                     bar.set_description("warm-up" if warming else "fine-tuning", refresh=False)
                     bar.set_postfix(**self._how_it_goes())
         self.stage.close()
-        self.processes.finished(self._learned(), self.done)
+        self.processes.stepped(self._learned(), self.done, last=True)
 
     def _how_it_goes(self) -> dict[str, str]:
         """Means over as many steps as see all views: these differ more than steps do."""

@@ -37,10 +37,7 @@ class SharedStage(Stage2):
         return super().begin(opacities)
 
     def figures(self) -> list[list[float]]:
-        """Of each view drawn in this step that counts, for ``share``.
-
-        Fragments per pixel now and before, what the pressure acts on, and the loss.
-        """
+        """Of each view drawn in this step that counts, four figures for ``share``."""
         return self._views.rows()
 
     def share(self, views: Sequence[Hashable], figures: Tensor) -> None:
@@ -48,7 +45,8 @@ class SharedStage(Stage2):
 
         Args:
             views: all of this step, in the same order in every process.
-            figures: (V, 4), the rows that ``figures`` gave in the processes that drew them.
+            figures: (V, 4), the rows that ``figures`` gave in the processes that drew them:
+                fragments per pixel now and before, what the pressure acts on, and the loss.
         """
         for known, count in zip((self._before, self._after), self._visited, strict=True):
             for picture in list(known)[count:]:  # the order of what is new must be the same
@@ -112,9 +110,6 @@ class Processes:
         Args:
             learned: all that learns, by name.
             due: it is time for a checkpoint after this step, by this process.
-
-        Raises:
-            RanksError: another process is gone.
         """
         if not self.several:
             return
@@ -128,14 +123,9 @@ class Processes:
         if came and not waiting.number:
             signal.raise_signal(came[0])  # it came to another process: all end after this step
 
-    def stepped(self, learned: Mapping[str, Tensor], step: int) -> None:
+    def stepped(self, learned: Mapping[str, Tensor], step: int, *, last: bool = False) -> None:
         """Compare all that learns, from time to time; raises RanksError if processes differ."""
-        if step % _COMPARE == 0:
-            self.finished(learned, step)
-
-    def finished(self, learned: Mapping[str, Tensor], step: int) -> None:
-        """Compare all that learns, after the last step; raises RanksError if processes differ."""
-        if self.several:
+        if self.several and (last or step % _COMPARE == 0):
             self.compare(learned, step)
 
     def keeps(self, due: bool) -> bool:
@@ -176,23 +166,18 @@ class Processes:
         Args:
             leaves: the tensors that learn. Their gradients are changed in place, and are there
                 afterwards if any process has one.
-            rows: four figures of each view that this process drew.
-            views: how many all processes drew.
+            rows: four figures of each view that this process drew, of ``views`` in all.
             flags: what this process noticed.
 
         Returns:
             (views, 4) figures of all views; and of each flag, whether any process has it.
-
-        Raises:
-            RanksError: another process is gone.
         """
         table = leaves[0].new_zeros(views, 4)
         if rows:
             table[self.ranks.rank :: self.ranks.size] = table.new_tensor(rows)
         noticed = table.new_tensor(flags)
         there = table.new_tensor([leaf.grad is not None for leaf in leaves])
-        told = self._told(leaves)
-        *sums, there, noticed, table = self._summed([*told, there, noticed, table])
+        *sums, there, noticed, table = self._summed([*self._told(leaves), there, noticed, table])
         for leaf, total, some in zip(leaves, sums, there.tolist(), strict=True):
             leaf.grad = self._gradient(leaf, total) if some else None
         return table, [some > 0 for some in noticed.tolist()]
@@ -215,10 +200,6 @@ class Processes:
         ]
 
     def compare(self, tensors: Mapping[str, Tensor], step: int) -> None:
-        """Stop unless all processes hold the same bits.
-
-        Raises:
-            RanksError: they differ.
-        """
+        """Raise RanksError unless all processes hold the same bits."""
         known = {name: fingerprint(tensor) for name, tensor in tensors.items()}
         self.ranks.agree(known, f"fine-tuning, after step {step}")
