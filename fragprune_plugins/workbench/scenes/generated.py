@@ -73,8 +73,6 @@ def around(
     They look at its robust centre from where nine tenths of it fill the picture, or from nearer.
 
     Args:
-        splat: N Gaussians.
-        count: cameras.
         pixels: of each side of their pictures.
         background: (3,) RGB; black when None.
         seed: of the distances.
@@ -116,12 +114,11 @@ def _direction(number: int, count: int, steepest: float = 1.0) -> Tensor:
 def between(cameras: Named, *, seed: int = 0) -> Named:
     """Cameras between each given one and those near it, in place and in what they look at.
 
+    There are up to four for each camera: none towards one that looks more than a quarter turn away.
+
     Args:
         cameras: the given ones, on one device.
         seed: of how far each is on the way.
-
-    Returns:
-        Up to four for each camera: none towards one that looks more than a quarter turn away.
     """
     stream = random.Random(seed)
     return [
@@ -134,13 +131,12 @@ def between(cameras: Named, *, seed: int = 0) -> Named:
 def beside(cameras: Named, count: int, *, seed: int = 0) -> Named:
     """Cameras next to given ones: on the way to one nearby, or on the way away from it.
 
+    There are none if no two of the given ones look the same way.
+
     Args:
         cameras: the given ones, on one device.
         count: of cameras; they take turns at being next to each given one.
         seed: of which one is nearby, and how far the way is.
-
-    Returns:
-        So many; none if no two of the given ones look the same way.
     """
     stream, found = random.Random(seed), []
     near = [(i, others) for i, others in enumerate(_neighbours(cameras)) if others]
@@ -186,8 +182,6 @@ def interpolate(a: View, b: View, t: float) -> View:
     interpolation of theirs, the short way round.
 
     Args:
-        a: where ``t`` is 0.
-        b: where ``t`` is 1.
         t: 0 to 1 on the way; outside, straight on and turning on.
     """
     one, other = (view.viewmatrix.detach().double().cpu() for view in (a, b))
@@ -214,18 +208,10 @@ def moved(view: View, viewmatrix: Tensor, campos: Tensor) -> View:
 
 
 def hold_out(items: Sequence[Item]) -> tuple[list[Item], list[Item]]:
-    """Every 8th for measuring, the rest to learn from: the rest, and every 8th.
-
-    Raises:
-        DatasetError: there is nothing to learn from.
-    """
+    """The items to learn from, and every 8th for measuring; DatasetError if there are too few."""
     if len(items) < 2:
-        raise DatasetError(
-            "cameras",
-            f"{len(items)}",
-            "at least two: the first of each eight is held out for the figures",
-            "Pass more cameras.",
-        )
+        expected = "at least two: the first of each eight is held out for the figures"
+        raise DatasetError("cameras", f"{len(items)}", expected, "Pass more cameras.")
     rest = [item for index, item in enumerate(items) if index % HOLD_OUT]
     return rest, list(items[::HOLD_OUT])
 

@@ -55,28 +55,12 @@ class Camera:
     def resized(self, width: int, height: int) -> Camera:
         """The same camera with another number of pixels."""
         x, y = width / self.width, height / self.height
-        return replace(
-            self,
-            width=width,
-            height=height,
-            fx=self.fx * x,
-            fy=self.fy * y,
-            cx=self.cx * x,
-            cy=self.cy * y,
-        )
+        focal, centre = (self.fx * x, self.fy * y), (self.cx * x, self.cy * y)
+        return Camera(self.rotation, self.translation, width, height, *focal, *centre)
 
     def view(self, background: Tensor | None = None) -> View:
         """The camera as a view for engines, computed in float64, float32 in the result."""
-        exact = View.pinhole(
-            self.rotation,
-            self.translation,
-            width=self.width,
-            height=self.height,
-            fx=self.fx,
-            fy=self.fy,
-            cx=self.cx,
-            cy=self.cy,
-        )
+        exact = View.pinhole(**vars(self))
         return replace(
             exact,
             viewmatrix=exact.viewmatrix.float(),

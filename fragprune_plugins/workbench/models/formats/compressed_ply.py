@@ -127,9 +127,8 @@ def _unpacked(packed: npt.NDArray[np.uint32], bits: tuple[int, ...]) -> npt.NDAr
     fields, at = [], sum(bits)
     for width in bits:
         at -= width
-        fields.append(
-            ((packed >> np.uint32(at)) & np.uint32((1 << width) - 1)) / ((1 << width) - 1)
-        )
+        most = (1 << width) - 1
+        fields.append(((packed >> np.uint32(at)) & np.uint32(most)) / most)
     return np.stack(fields, axis=1)
 
 

@@ -168,22 +168,18 @@ def write(file: BinaryIO, splat: Model) -> None:
     views: list[dict[str, Any]] = []
     accessors: list[dict[str, Any]] = []
     at = 0
+    kinds = {width: name for name, width in _WIDTHS.items()}
     for values in columns.values():
-        views.append(
-            {"buffer": 0, "byteOffset": at, "byteLength": values.nbytes, "target": _ARRAY_BUFFER}
-        )
-        accessors.append(
-            {
-                "bufferView": len(accessors),
-                "componentType": _UBYTE if values.dtype == np.uint8 else _FLOAT,
-                "count": len(values),
-                "type": {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[values.shape[1]],
-            }
-        )
+        place = {"buffer": 0, "byteOffset": at, "byteLength": values.nbytes}
+        views.append(place | {"target": _ARRAY_BUFFER})
+        kind = _UBYTE if values.dtype == np.uint8 else _FLOAT
+        rows = {"count": len(values), "type": kinds[values.shape[1]]}
+        accessors.append({"bufferView": len(accessors), "componentType": kind, **rows})
         at += values.nbytes
     accessors[0] |= {"min": xyz.min(axis=0).tolist(), "max": xyz.max(axis=0).tolist()}
     accessors[1]["normalized"] = True
     attributes = {name: index for index, name in enumerate(columns)}
+    primitive = {"attributes": attributes, "mode": _POINTS, "extensions": {BASE: extension}}
     scene = {
         "asset": {"version": "2.0", "generator": f"fragprune {VERSION}"},
         "extensionsUsed": used,
@@ -193,13 +189,7 @@ def write(file: BinaryIO, splat: Model) -> None:
         "buffers": [{"byteLength": at}],
         "bufferViews": views,
         "accessors": accessors,
-        "meshes": [
-            {
-                "primitives": [
-                    {"attributes": attributes, "mode": _POINTS, "extensions": {BASE: extension}}
-                ]
-            }
-        ],
+        "meshes": [{"primitives": [primitive]}],
     }
     head = json.dumps(scene, separators=(",", ":")).encode()
     head += b" " * (-len(head) % 4)

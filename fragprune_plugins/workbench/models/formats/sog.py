@@ -130,7 +130,6 @@ def _read(meta: dict[str, Any], load: Load) -> Model:
 
 def _pixels(data: bytes, count: int) -> Bytes:
     """The pixels of a WebP (height, width, 4), which has to have a texel for each Gaussian."""
-
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the count decides
         with Image.open(io.BytesIO(data), formats=["WEBP"]) as picture:
@@ -252,7 +251,6 @@ def _packed_rotations(quaternions: npt.NDArray[Any]) -> Bytes:
 
 
 def _webp(pixels: Bytes) -> bytes:
-
     out = io.BytesIO()
     # exact: also the colours of texels whose opacity is 0
     Image.fromarray(pixels).save(out, "WEBP", lossless=True, exact=True)

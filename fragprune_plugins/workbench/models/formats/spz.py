@@ -30,7 +30,6 @@ from fragprune_plugins.workbench.models.formats.values import (
     of_codes,
     opacities_of,
     quaternions_of,
-    rows,
     splat_of,
     take,
     turned,
@@ -164,7 +163,9 @@ def _splat(header: _Header, parts: list[bytes], codes: bytes | None, stop: bytes
     count = header.count
     if codes is not None and len(codes) != count:
         raise ValueError(f"{len(codes)} thresholds for {count} Gaussians")
-    positions, alphas, colours, scales, rotations, sh = (rows(part, count) for part in parts)
+    positions, alphas, colours, scales, rotations, sh = (
+        np.frombuffer(part, np.uint8).reshape(count, -1) for part in parts
+    )
     b = positions.reshape(count, 3, 3).astype(np.int32)
     fixed = b[..., 0] | b[..., 1] << 8 | b[..., 2] << 16
     fixed -= (fixed & 0x800000) << 1
