@@ -27,16 +27,8 @@ from fragprune_plugins.engines.fragments import fragments
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.schedule import USUAL_STOP
 from fragprune_plugins.types import View, one_line
+from fragprune_plugins.workbench.figures import extents
 from fragprune_plugins.workbench.figures.evaluate import Candidate, frame_times
-from fragprune_plugins.workbench.figures.extents import (
-    CUTS,
-    SQRT8,
-    VIEWERS,
-    covered,
-    honouring,
-    quads,
-    shaded,
-)
 from fragprune_plugins.workbench.figures.metrics import psnr
 from fragprune_plugins.workbench.scenes.generated import Named
 
@@ -271,15 +263,15 @@ class _Survey:
         assert itself is not None
         self._radii = itself.radii
         inputs = self._itself.inputs(view)
-        squared = SQRT8.squared(opacities)
-        ellipses = covered(engine, replace(inputs, counts=True), squared)
+        squared = extents.SQRT8.squared(opacities)
+        ellipses = extents.covered(engine, replace(inputs, counts=True), squared)
         self._overdraw.append(float(ellipses.fragments_per_pixel))
-        for viewer in VIEWERS:
-            self._asked.setdefault(viewer.names, []).append(shaded(engine, inputs, viewer))
+        for viewer in extents.VIEWERS:
+            self._asked.setdefault(viewer.names, []).append(extents.shaded(engine, inputs, viewer))
         cut = self._itself.thresholds(inputs)
         if cut is not None:
-            reach = honouring(cut, opacities)
-            self._asked.setdefault(HONOURING, []).append(quads(engine, inputs, reach))
+            reach = extents.honouring(cut, opacities)
+            self._asked.setdefault(HONOURING, []).append(extents.quads(engine, inputs, reach))
         if shown:
             assert itself.fragments is not None
             assert ellipses.fragments is not None
@@ -339,7 +331,7 @@ def _candidates(model: Model) -> dict[str, Candidate]:
     """The model as it is, first, and with every cut on top."""
     itself, own = Candidate(model), model.falloff
     found = {AS_IT_IS: itself}
-    for cut in CUTS:
+    for cut in extents.CUTS:
         thresholds = cut.thresholds(itself.splats.opacities)
         thresholds = thresholds if own is None else torch.maximum(own, thresholds)
         found[cut.name] = itself.sharing(cut=thresholds)
@@ -360,10 +352,10 @@ def _mean(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 
 
 def _viewers(asked: Mapping[str, Sequence[float]]) -> list[dict[str, Any]]:
-    rules = {viewer.names: (viewer.extent.name, viewer.shape) for viewer in VIEWERS}
+    rules = {viewer.names: (viewer.extent.name, viewer.shape) for viewer in extents.VIEWERS}
     rules[HONOURING] = ("quads by cutoffs, 1/255", "quad")
     means = {names: statistics.fmean(pixels) for names, pixels in asked.items()}
-    first = means[VIEWERS[0].names]
+    first = means[extents.VIEWERS[0].names]
     return [
         {
             "viewers": names,

@@ -33,15 +33,8 @@ from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import FragpruneError
 from fragprune_plugins.slicing.cutting import expect_right
 from fragprune_plugins.types import RasterInputs, Splats, one_line
+from fragprune_plugins.workbench.bench import timing
 from fragprune_plugins.workbench.bench.scene import make_scene, make_view
-from fragprune_plugins.workbench.bench.timing import (
-    PASSES,
-    TRUNCATION,
-    Case,
-    describe_machine,
-    load_average,
-    measure,
-)
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.doctor import peers
 from fragprune_plugins.workbench.doctor.emulated import (
@@ -105,7 +98,7 @@ def prove(say: Callable[[str], None] | None = None, repeats: int = 9) -> Report:
         "format": FORMAT,
         "fragprune": VERSION,
         "when": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
-        "machine": describe_machine(kind) | {"load_before": load_average()},
+        "machine": timing.describe_machine(kind) | {"load_before": timing.load_average()},
         "clocks": _clocks() if kind == "cuda" else None,
         "peers": peers.installed(),
         "hashes": _hashes(),
@@ -114,7 +107,7 @@ def prove(say: Callable[[str], None] | None = None, repeats: int = 9) -> Report:
         "emulation": emulation,
         "times": list(_times(passed, kind, repeats, say)),
     }
-    data["machine"]["load_after"] = load_average()
+    data["machine"]["load_after"] = timing.load_average()
     return Report(data, _text(data), exit_code=0 if _proved(data) else 1)
 
 
@@ -178,10 +171,10 @@ def _times(
     ours = [each for each in timed if each.ours]
     for count, size in SCENES[kind]:
         splats, view = make_scene(count).to(kind).splats(), make_view(*size).to(kind)
-        cut = torch.full_like(splats.opacities, TRUNCATION)
+        cut = torch.full_like(splats.opacities, timing.TRUNCATION)
         cases = [
-            Case(f"bench-{count}", view, splats, way, thresholds)
-            for way in PASSES
+            timing.Case(f"bench-{count}", view, splats, way, thresholds)
+            for way in timing.PASSES
             for thresholds in (None, cut)
         ]
         plain = [case for case in cases if case.thresholds is None]
@@ -191,7 +184,7 @@ def _times(
             if not engines:
                 continue
             say(f"timing {what}: {count:,} Gaussians at {size[0]}x{size[1]}")
-            rows = measure(some, [each.engine for each in engines], repeats=repeats)
+            rows = timing.measure(some, [each.engine for each in engines], repeats=repeats)
             names = [each.name for _ in some for each in engines]
             for name, row in zip(names, rows, strict=True):
                 yield {"round": what} | _finite(row) | {"engine": name}
@@ -321,7 +314,7 @@ def scenes() -> tuple[Scene, ...]:
         Scene("cutoffs", inputs, thresholds),
         Scene("no cutoffs", inputs, None),
         Scene("a stop", replace(inputs, stop=0.05), thresholds),
-        Scene("the timed scene, small", timed, torch.full((6000,), TRUNCATION)),
+        Scene("the timed scene, small", timed, torch.full((6000,), timing.TRUNCATION)),
     )
 
 

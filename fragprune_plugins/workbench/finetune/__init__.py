@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 import click
 
+from fragprune_plugins.workbench.commands import options as shared
 from fragprune_plugins.workbench.commands.command import (
     Command,
     Report,
@@ -18,14 +19,6 @@ from fragprune_plugins.workbench.commands.learning import (
     learning_options,
 )
 from fragprune_plugins.workbench.commands.logs import log_option
-from fragprune_plugins.workbench.commands.options import (
-    FILE,
-    MODEL,
-    OutFile,
-    engine_options,
-    scene_options,
-    shard_option,
-)
 from fragprune_plugins.workbench.commands.rules import Alone, Needs, apart
 from fragprune_plugins.workbench.models import formats
 from fragprune_plugins.workbench.ranks import launched
@@ -67,10 +60,10 @@ RULES = (
 
 
 @click.command("finetune", cls=Command, rules=RULES)
-@click.argument("model", type=MODEL)
+@click.argument("model", type=shared.MODEL)
 @click.option(
     "--out",
-    type=OutFile(*formats.ENDINGS),
+    type=shared.OutFile(*formats.ENDINGS),
     required=True,
     help="New model: .ply, .spz, .sog or .glb, which hold its cutoffs. .splat and "
     ".compressed.ply cannot hold any.",
@@ -85,10 +78,10 @@ RULES = (
 )
 @click.option(
     "--cameras",
-    type=FILE,
+    type=shared.FILE,
     help="With --self: cameras.json of a 3DGS model, or transforms_*.json; every 8th is held out.",
 )
-@scene_options()
+@shared.scene_options()
 @learning_options(every_goal=True)
 @log_option
 @config_option
@@ -112,12 +105,12 @@ RULES = (
     "learning rates are the square root of N times higher. More than one serves several "
     "processes under torchrun, which draw them side by side.",
 )
-@shard_option
+@shared.shard_option
 @click.option("--no-truncation", is_flag=True, help="Ignore cutoffs stored with MODEL.")
 @click.option(
     "--again", is_flag=True, help="Begin anew, though OUT is finished or there is a checkpoint."
 )
-@engine_options()
+@shared.engine_options()
 @first_process_prints()
 def command(**options: Any) -> Report | None:
     """Learn how far each Gaussian of MODEL must reach.

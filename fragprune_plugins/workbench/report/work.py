@@ -14,18 +14,11 @@ import torch
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import DatasetError, ModelFileError, RecordError, SidecarError
+from fragprune_plugins.files import records
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.reading import MEBIBYTE, Door, lies_in
-from fragprune_plugins.files.records import (
-    CONTROL,
-    DOOR,
-    Record,
-    control_of,
-    find,
-    located,
-    portable,
-)
+from fragprune_plugins.files.records import CONTROL, DOOR, Record
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import OwnCameras, open_engine, own_cameras
 from fragprune_plugins.workbench.commands.options import EngineOptions
@@ -55,20 +48,20 @@ _ONLY_CONTROLS = (
 
 def report(*, folder: Path, out: Path | None, data: Path | None, engine: EngineOptions) -> Report:
     """Do what ``fragprune report`` promises; its options are the arguments."""
-    records = find(folder)
-    for record in records:
+    every = records.find(folder)
+    for record in every:
         _check(record)
-    results = [record for record in records if record.command in ("run", "finetune")]
+    results = [record for record in every if record.command in ("run", "finetune")]
     pruned = [record for record in results if _goal(record) not in (None, CONTROL)]
-    main = [*records, *results, *pruned][-1]
+    main = [*every, *results, *pruned][-1]
     control = _goal(main) == CONTROL
-    others = [record for record in records if record is not main]
-    files = [record.path for record in records]
+    others = [record for record in every if record is not main]
+    files = [record.path for record in every]
     line = _sentence(main, files)
     with TemporaryDirectory() as name:
         pictures = Path(name)
         drawn, learning, missing = _draw(main, folder, pictures, data, partial(open_engine, engine))
-        more = [*learning, *_files(records, folder, pictures)]
+        more = [*learning, *_files(every, folder, pictures)]
         notes = [*([_ONLY_CONTROLS] if control else []), *([missing] if missing else [])]
         text = report_page.compose(
             report_page.TEMPLATE,
@@ -78,7 +71,7 @@ def report(*, folder: Path, out: Path | None, data: Path | None, engine: EngineO
             facts=_facts(main, files),
             quote=line,
             labels=("original", "control") if control else report_page.NAMES,
-            notes=portable(notes, folder),
+            notes=records.portable(notes, folder),
             table=_table(main),
             plots=more,
             others=[
@@ -151,7 +144,7 @@ def _sentence(record: Record, among: Sequence[Path]) -> str:
     name = data.get("adapter") or ""
     of = f"{name}, {data['iterations']:,} iterations: " if name else ""
     if len(columns) > 1 and record.command in ("run", "finetune"):
-        control = data.get("control") or control_of(data, among)
+        control = data.get("control") or records.control_of(data, among)
         return of + wording.outcome(record.command, data, control)
     if record.command == "compare":
         of = f"A is {data['a']['model']}, B is {data['b']['model']}: "
@@ -191,7 +184,7 @@ def _facts(record: Record, among: Sequence[Path]) -> list[tuple[str, str]]:
     data = record.data
     if record.command not in ("run", "finetune") or not (data.get("before") and data.get("after")):
         return []
-    return wording.headlines(data, data.get("control") or control_of(data, among))
+    return wording.headlines(data, data.get("control") or records.control_of(data, among))
 
 
 def _settings(record: Record) -> list[list[str]]:
@@ -228,7 +221,9 @@ def _source(record: Record, data: Path | None) -> _Source | None:
     own = own_cameras(record)
     if own is not None:
         with DOOR.stated(record.path):
-            models = [located(record.data[name], record.path.parent) for name in ("model", "out")]
+            models = [
+                records.located(record.data[name], record.path.parent) for name in ("model", "out")
+            ]
         needs = list(filter(None, [own.scene.data, own.cameras]))
         pictures = own.pictures if needs else partial(_from_above, own)
         return _Source(models, False, {}, needs, pictures)
@@ -294,13 +289,13 @@ def _draw(
     return report_page.draw_views(folder, before, after, dataset.test, engine), learning, ""
 
 
-def _files(records: list[Record], inside: Path, folder: Path) -> list[tuple[str, str]]:
+def _files(every: list[Record], inside: Path, folder: Path) -> list[tuple[str, str]]:
     """Copy pictures of compare and profile into the folder; returns (heading, file) of each.
 
     Only PNGs beside the record, and no link out of ``inside``.
     """
     found: list[tuple[str, str]] = []
-    for record in records:
+    for record in every:
         for name in record.data.get("files", ()):
             file = record.path.parent / Path(name).name
             if not lies_in(file, inside):

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from fragprune_plugins.constants import ALPHA_MIN
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.workbench.models.formats.values import z_order
+from fragprune_plugins.workbench.models.formats.arrays import z_order
 
 CUTOFF_MAX = -2 * math.log(ALPHA_MIN)
 """The largest cutoff that decides anything: a fragment beyond it is fainter than 1/255."""
