@@ -153,13 +153,6 @@ def joined(device: torch.device) -> Iterator[Ranks]:
     import torch
     import torch.distributed as dist
 
-    if not dist.is_available():
-        raise RanksError(
-            "learning",
-            f"{ranks.size} processes, and a torch that was built without torch.distributed",
-            "a torch with it",
-            "Install the torch of pytorch.org, or start one process.",
-        )
     # Its functions have the group as a default, of the time of their import: imported later, as by
     # an optimizer, they would keep the group and its threads alive until Python is gone, and a
     # thread that then frees a tensor aborts the process.

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from fragprune_plugins.errors import EngineError
 from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats
-from fragprune_plugins.workbench.doctor.work import version_of
+from fragprune_plugins.workbench.doctor.work import package_version
 
 
 class Peer:
@@ -55,7 +55,9 @@ class Peer:
 
 def installed() -> dict[str, str]:
     """The packages of peers that are here, with their versions."""
-    return {name: version_of(name) or "unknown" for name in PEERS if find_spec(name) is not None}
+    return {
+        name: package_version(name) or "unknown" for name in PEERS if find_spec(name) is not None
+    }
 
 
 def peer(name: str) -> Peer:

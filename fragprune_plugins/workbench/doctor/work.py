@@ -23,7 +23,7 @@ _AGREES = {"agrees": True, "fails": False, "could not run": None}
 
 def examine() -> Report:
     """What is installed, and what is wrong with it."""
-    packages = {name: version_of(name) for name in _PACKAGES}
+    packages = {name: package_version(name) for name in _PACKAGES}
     native = _cpu_engine()
     # This comes first, because a GPU may allow only one process.
     verdict = self_check.check_in_subprocess("cuda") if driver.missing() is None else None
@@ -116,7 +116,7 @@ def _of_cuda(gpu: dict[str, Any]) -> str:
     )
 
 
-def version_of(package: str) -> str | None:
+def package_version(package: str) -> str | None:
     """The version of a package; None if it is not installed."""
     try:
         return version(package)

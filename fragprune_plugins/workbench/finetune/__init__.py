@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+import contextlib
+from typing import Any
 
 import click
 
@@ -24,22 +25,14 @@ from fragprune_plugins.workbench.models import formats
 from fragprune_plugins.workbench.ranks import launched
 
 
-def _share(
-    ctx: click.Context, param: click.Parameter, value: str | None
-) -> float | Literal["auto", "visible"] | None:
+def _share(ctx: click.Context, param: click.Parameter, value: str | None) -> float | str | None:
     """A share in (0, 1], or a word."""
-    if value is None:
-        return None
-    words: dict[str, Literal["auto", "visible"]] = {"auto": "auto", "visible": "visible"}
-    if value in words:
-        return words[value]
-    try:
-        share = float(value)
-    except ValueError:
-        share = 0.0
-    if not 0 < share <= 1:
-        raise click.BadParameter(f"{value!r} is not auto, visible or a number with 0 < X <= 1.")
-    return share
+    if value in (None, "auto", "visible"):
+        return value
+    with contextlib.suppress(ValueError):
+        if 0 < float(value) <= 1:
+            return float(value)
+    raise click.BadParameter(f"{value!r} is not auto, visible or a number with 0 < X <= 1.")
 
 
 _PARTS = "options that each process can follow with a part of the Gaussians"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -16,6 +16,7 @@ from torch import Tensor
 from fragprune_plugins.errors import OutputError, UsageError
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.model import Model
+from fragprune_plugins.workbench.figures.pictures import picture
 from fragprune_plugins.workbench.figures.viewing import overview
 from fragprune_plugins.workbench.scenes.generated import Named, bounds, interpolate, moved
 from fragprune_plugins.workbench.scenes.pinhole import look_at
@@ -88,25 +89,18 @@ def write_mp4(path: Path, frames: Iterable[Tensor], fps: int) -> None:
     with replacing(path) as temporary:
         writer = None
         try:
-            for pixels in _bytes(frames):
+            for frame in frames:
+                even = frame[:, : frame.shape[1] // 2 * 2, : frame.shape[2] // 2 * 2]
+                shown = picture(even)
                 if writer is None:
-                    height, width = pixels.shape[:2]
                     writer = encoder.write_frames(
-                        str(temporary), (width, height), fps=fps, macro_block_size=2, quality=8
+                        str(temporary), shown.size, fps=fps, macro_block_size=2, quality=8
                     )
                     writer.send(None)
-                writer.send(pixels.numpy().tobytes())
+                writer.send(shown.tobytes())
         except OSError as error:
             why = str(error).strip().split("\n")[-1][:200]
             raise OutputError(str(path), why, "a film", "Check the place and its space.") from error
         finally:
             if writer is not None:
                 writer.close()
-
-
-def _bytes(frames: Iterable[Tensor]) -> Iterator[Tensor]:
-    """(H, W, 3) bytes of each picture, both sides even."""
-    for frame in frames:
-        _, height, width = frame.shape
-        even = frame[:, : height // 2 * 2, : width // 2 * 2]
-        yield (255 * even.clamp(0, 1)).round().byte().permute(1, 2, 0).contiguous().cpu()
