@@ -207,7 +207,6 @@ def reaching(inputs: RasterInputs, splats: Splats, thresholds: Tensor | None) ->
 
     Args:
         inputs: the view and its rules; its Gaussians are not used.
-        splats: N Gaussians.
         thresholds: (N,) falloff, or None.
     """
     view, means = inputs.view, splats.means
@@ -269,11 +268,7 @@ def _expect_sendable(inputs: RasterInputs) -> Splats:
 
 
 class Shards(Processes):
-    """Processes that each hold a part of the model's Gaussians.
-
-    Args:
-        count: of this process' Gaussians.
-    """
+    """Processes that each hold a part of the model's Gaussians; this one holds ``count``."""
 
     divided = True
 

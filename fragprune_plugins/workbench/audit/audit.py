@@ -69,15 +69,11 @@ _COUNTS = ("fragments_per_pixel", "evaluated_per_pixel")
 
 @dataclass
 class Idle:
-    """Counts of weighed fragments.
+    """Counts of weighed fragments: drawn at some pixels, and of them idle alone and together.
 
     Attributes:
-        pixels: that were looked at.
-        drawn: fragments there.
-        alone: of them, those idle alone.
-        together: of them, those idle together.
         weight: of those idle together, sum; a pixel has 1 at most.
-        classes: (2, 3, 3) drawn, and idle together, by opacity and radius.
+        classes: (2, 9) drawn, and idle together, by opacity and radius.
         reasons: (2, 4) likewise by ``REASONS``.
     """
 
@@ -132,8 +128,7 @@ class Weighed:
     Attributes:
         drawn: whether there is a fragment.
         weights: T alpha.
-        alone: whether it is idle alone.
-        together: whether it is idle together.
+        alone, together: whether it is idle.
         reasons: index into ``REASONS``.
     """
 
@@ -247,11 +242,7 @@ class _Survey:
         self._radii = torch.empty(0)
 
     def draw(self, name: str, view: View, shown: bool) -> None:
-        """Draw a view of the model and of its cuts.
-
-        Args:
-            shown: pictures show it, and frames of it are timed.
-        """
+        """Draw a view of the model and of its cuts; if ``shown``, pictures show it."""
         engine, opacities, itself = self._engine, self._itself.splats.opacities, None
         for label, candidate in self.candidates.items():
             out = candidate.draw(engine, view, counts=itself is None)

@@ -63,9 +63,7 @@ class DemoSettings:
     """Settings of a demo.
 
     Attributes:
-        iterations: number of iterations of the host's own training.
-        finetune: number of iterations of stage 2.
-        device: "cpu" or a CUDA device.
+        iterations, finetune: of the host's own training, and of stage 2.
         views, width, points: of the scene, as ``make_scene`` takes them.
     """
 
@@ -230,7 +228,6 @@ def write_page(
 
     Args:
         report: the measurements; "larger" is added, frame times of pictures as large as the page's.
-        curves: the run's learning curves, one dict per step.
 
     Returns:
         The files as paths relative to ``out``.

@@ -148,14 +148,7 @@ def leave_panels(
 def draw_panels(
     out: Path, columns: dict[str, Candidate], shots: Sequence[Shot], engine: Engine
 ) -> list[Path]:
-    """Draw evenly spread views: photograph, renders, and fragment densities on one scale.
-
-    Args:
-        shots: the views; ``PANELS`` of them at most are drawn.
-
-    Returns:
-        The files, one for each drawn view.
-    """
+    """Draw ``PANELS`` evenly spread views at most: photograph, renders, fragments on one scale."""
     files = []
     chosen = evenly(shots, PANELS)
     for stem, shot in zip(stems([shot.name for shot in chosen]), chosen, strict=True):

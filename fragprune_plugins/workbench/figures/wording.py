@@ -78,10 +78,7 @@ def measured_with(columns: Mapping[str, dict[str, Any]]) -> str:
 
 
 def tabulate(columns: Mapping[str, dict[str, Any]]) -> list[list[str]]:
-    """Rows of a table, the first one its head: a figure, each measurement's, and the change.
-
-    The change is that between the last two measurements; one alone has none.
-    """
+    """Rows of a table, its head first: a figure, each measurement's, and the last two's change."""
     reports = list(columns.values())
     change = ["change"] if len(reports) > 1 else []
     rows = [["", *columns, *change]]
@@ -143,7 +140,7 @@ def outcome(command: str, data: dict[str, Any], control: dict[str, Any] | None) 
     Args:
         command: "run" or "finetune".
         data: its figures, including "before", "after" and "settings".
-        control: the measurement after as many iterations without truncation; None if not run.
+        control: what as many iterations without truncation gave; None if not run.
     """
     before, after = data["before"], data["after"]
     gained = f"{gain(before, after)} that were held out"

@@ -66,7 +66,6 @@ class Processes:
 
     Attributes:
         first: this process writes files and speaks.
-        several: there are others.
         divided: other processes hold other Gaussians of the model.
         may_end: a signal may end the training after this step.
     """
@@ -75,12 +74,12 @@ class Processes:
     may_end = True
 
     def __init__(self, ranks: Ranks) -> None:
-        self.ranks, self.first, self.several = ranks, ranks.first, ranks.several
+        self.ranks, self.first = ranks, ranks.first
         self._due = False  # it is time for a checkpoint, some process says
 
     def expect_able(self, settings: Settings) -> None:
         """Refuse views that cannot be divided, and times, which others would disturb."""
-        if self.several and isinstance(settings.goal, Faster):
+        if self.ranks.several and isinstance(settings.goal, Faster):
             raise UsageError(
                 "target time",
                 f"{self.ranks.size} processes, which would disturb each other's measurements",
@@ -111,7 +110,7 @@ class Processes:
             learned: all that learns, by name.
             due: it is time for a checkpoint after this step, by this process.
         """
-        if not self.several:
+        if not self.ranks.several:
             return
         flags = [*(waiting.number == number for number in _SIGNALS), due]
         rows, leaves = stage.figures(), [*learned.values()]
@@ -125,12 +124,12 @@ class Processes:
 
     def stepped(self, learned: Mapping[str, Tensor], step: int, *, last: bool = False) -> None:
         """Compare all that learns, from time to time; raises RanksError if processes differ."""
-        if self.several and (last or step % _COMPARE == 0):
+        if self.ranks.several and (last or step % _COMPARE == 0):
             self.compare(learned, step)
 
     def keeps(self, due: bool) -> bool:
         """Whether it is time for a checkpoint after this step, as all decided in it."""
-        return self._due if self.several else due
+        return self._due if self.ranks.several else due
 
     def described(self, configuration: dict[str, Any]) -> dict[str, Any]:
         """What decides the result, in the words of all processes together."""

@@ -59,11 +59,7 @@ class _Opened:
 
 
 def finetune(**options: Any) -> Report | None:
-    """Fine-tune, with the fields of ``Asked``; the report, in the first process.
-
-    Raises:
-        UsageError: ``out`` is no place for the result, or one process divides the model.
-    """
+    """Fine-tune, with the fields of ``Asked``; the report, in the first process."""
     asked = Asked(**options)
     if asked.shard:
         require_several()

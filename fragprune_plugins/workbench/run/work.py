@@ -144,10 +144,7 @@ def _text(path: Path | None) -> str | None:
 
 
 def photographs_of(summary: launch.RunSummary) -> Recorded | None:
-    """How to read the host's data and draw its models; None if they cannot be measured.
-
-    Joint learning leaves one model.
-    """
+    """How to read the host's data and draw its models; None if they cannot be measured."""
     if not summary.photographs:
         return None
     left = tuple(path for path in (summary.model_before, summary.model_after) if path)
@@ -155,11 +152,7 @@ def photographs_of(summary: launch.RunSummary) -> Recorded | None:
 
 
 def measure_models(read: Recorded, engine: EngineOptions) -> list[dict[str, Any]]:
-    """Measure the models on held-out views, on the host's device if an engine can draw there.
-
-    Returns:
-        The measurements before and after; after joint learning the latter alone.
-    """
+    """Measure the models on held-out views, on the host's device if an engine can draw there."""
     device = "cpu" if engine.device == "cpu" else "auto"
     rasterizer, where = open_engine(EngineOptions(engine.name, device))
     dataset = load_photographs(read.photographs)
@@ -226,12 +219,7 @@ def _viewable(model: Path) -> bool:
 
 @dataclass
 class Looking:
-    """What ``RunOptions.look`` calls.
-
-    Attributes:
-        engine: draws.
-        trial: what was found; None before, and where nothing could be tried.
-    """
+    """What ``RunOptions.look`` calls; ``trial`` is None where nothing could be tried."""
 
     engine: EngineOptions
     trial: Trial | None = None

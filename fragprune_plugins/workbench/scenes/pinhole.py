@@ -29,12 +29,9 @@ class Camera:
     Attributes:
         rotation: (3, 3) float64, world to camera (x right, y down, z forward).
         translation: (3,) float64.
-        width: pixels.
-        height: pixels.
-        fx: focal length, pixels.
-        fy: focal length, pixels.
-        cx: principal point, pixels; width / 2 is the centre.
-        cy: principal point, pixels.
+        width, height: pixels.
+        fx, fy: focal lengths, pixels.
+        cx, cy: principal point, pixels; width / 2 is the centre.
     """
 
     rotation: Tensor
@@ -71,11 +68,7 @@ class Camera:
 
 
 def check_pose(rotation: Tensor, translation: Tensor) -> None:
-    """Check that tensors are a camera's pose: see ``Camera``. Waits for a GPU.
-
-    Raises:
-        InputError: not a rotation matrix, or the camera is not within ``DISTANCE_MAX``.
-    """
+    """Raise InputError unless it is a rotation, and a place within ``DISTANCE_MAX``."""
     require_tensor("rotation", rotation, 3, 3)
     require_tensor("translation", translation, 3)
     exact = rotation.detach().double()

@@ -88,9 +88,6 @@ def make_site(
         layers: one or two; the first is on the left.
         cameras: to choose from; may be none.
         start: the first camera; its background is the page's.
-
-    Raises:
-        DatasetError: a photograph cannot be read.
     """
     site = {each.name: each.read_bytes() for each in sorted(STATIC.iterdir()) if each.is_file()}
     described = []
@@ -162,10 +159,7 @@ def compacted(site: Site) -> tuple[Site, list[str]]:
 
 
 def single_page(site: Site) -> bytes:
-    """A viewer as one HTML file, which a browser opens from disk.
-
-    Args:
-        site: the viewer, better ``compacted``.
+    """A viewer, better ``compacted``, as one HTML file, which a browser opens from disk.
 
     Raises:
         OutputError: it is larger than ``SINGLE_MAX``.
@@ -228,10 +222,7 @@ _KINDS = {
 
 
 def open_server(site: Site, port: int = 0) -> ThreadingHTTPServer:
-    """A server of these files, bound to 127.0.0.1; ``serve_forever`` runs it.
-
-    Args:
-        port: 0 for any free one.
+    """A server of these files, bound to 127.0.0.1 and a port; 0 takes any free one.
 
     Raises:
         OutputError: the port cannot be had.
