@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from itertools import accumulate
 from typing import Any
 
 import torch
@@ -192,11 +191,8 @@ class Processes:
     def _summed(self, parts: Sequence[Tensor]) -> list[Tensor]:
         flat = torch.cat([part.reshape(-1) for part in parts])
         self.ranks.sum(flat)
-        ends = accumulate(part.numel() for part in parts)
-        return [
-            flat[end - part.numel() : end].view_as(part)
-            for end, part in zip(ends, parts, strict=True)
-        ]
+        pieces = flat.split([part.numel() for part in parts])
+        return [piece.view_as(part) for piece, part in zip(pieces, parts, strict=True)]
 
     def compare(self, tensors: Mapping[str, Tensor], step: int) -> None:
         """Raise RanksError unless all processes hold the same bits."""

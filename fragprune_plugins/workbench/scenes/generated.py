@@ -12,7 +12,7 @@ import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar, TypeVar
+from typing import ClassVar
 
 import torch
 from scipy.spatial.transform import Rotation
@@ -26,12 +26,10 @@ from fragprune_plugins.types import RasterInputs, View, one_line
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 from fragprune_plugins.workbench.scenes.pinhole import look_at
-from fragprune_plugins.workbench.scenes.posed import HOLD_OUT
+from fragprune_plugins.workbench.scenes.posed import hold_out
 
 Named = list[tuple[str, View]]
 """Names of views, and the views."""
-
-Item = TypeVar("Item")
 
 ORBIT_VIEWS = 96
 """Cameras that ``around`` gives by default."""
@@ -207,15 +205,6 @@ def moved(view: View, viewmatrix: Tensor, campos: Tensor) -> View:
     )
 
 
-def hold_out(items: Sequence[Item]) -> tuple[list[Item], list[Item]]:
-    """The items to learn from, and every 8th for measuring; DatasetError if there are too few."""
-    if len(items) < 2:
-        expected = "at least two: the first of each eight is held out for the figures"
-        raise DatasetError("cameras", f"{len(items)}", expected, "Pass more cameras.")
-    rest = [item for index, item in enumerate(items) if index % HOLD_OUT]
-    return rest, list(items[::HOLD_OUT])
-
-
 @dataclass(frozen=True, eq=False)
 class OwnPicture(Shot):
     """A camera, and the picture that a model gives there.
@@ -265,6 +254,9 @@ def own_pictures(
     draw = _drawing(model, engine)
     views = around(model, seed=seed) if cameras is None else cameras
     if held_out is None:
+        if len(views) < 2:
+            expected = "at least two: the first of each eight is held out for the figures"
+            raise DatasetError("cameras", f"{len(views)}", expected, "Pass more cameras.")
         views, held_out = hold_out(views)
     train, test = (
         [OwnPicture(name, view, draw) for name, view in part]
