@@ -82,7 +82,6 @@ def thresholds_for(
     Args:
         given: a store, for which plugins are asked unless it is neutral; or thresholds to use as
             they are.
-        plugins: the plugins to ask; None for those of the process.
 
     Raises:
         PluginError: a plugin raised, or its answer is not N thresholds in (0, 1).
@@ -116,9 +115,8 @@ def select_adapter(
 
 
 def _no_engine(answer: Any) -> Wrong | None:
-    fits = callable(getattr(answer, "rasterize", None)) and isinstance(
-        getattr(answer, "name", None), str
-    )
+    named = isinstance(getattr(answer, "name", None), str)
+    fits = named and callable(getattr(answer, "rasterize", None))
     return None if fits else (repr(answer), "an engine: a name, and rasterize(inputs, thresholds)")
 
 

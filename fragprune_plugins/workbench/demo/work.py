@@ -17,7 +17,7 @@ import click
 from fragprune_plugins.files import records
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.hosts.photographs import Photographs
-from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.injection.launch import RunOptions, RunSummary, run
 from fragprune_plugins.learning.goals import Control
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hooks import engine_for
@@ -166,15 +166,7 @@ def run_demo(
     with _timed(seconds, "measure"):
         say("3/4  Measuring on the held-out views")
         candidates = [Candidate(each) for each in (before, after, control)]
-        report = _measure(scene, candidates, settings.engine) | {
-            "iterations": summary.steps,
-            "train_seconds": summary.train_seconds,
-            "adapter": summary.adapter,
-            "seed": settings.seed,
-            "model_before": str(summary.model_before),
-            "model_after": str(summary.model_after),
-            "settings": summary.settings,
-        }
+        report = _measure(scene, candidates, settings, summary)
     with _timed(seconds, "pictures"), claiming(out, "pictures", "index.html", "model"):
         say("4/4  Drawing the pictures")
         report["files"] = write_page(
@@ -189,10 +181,12 @@ def run_demo(
     return report
 
 
-def _measure(scene: Path, candidates: list[Candidate], engine: str) -> dict[str, Any]:
+def _measure(
+    scene: Path, candidates: list[Candidate], settings: DemoSettings, summary: RunSummary
+) -> dict[str, Any]:
     """Figures of the original, the pruned model and the control, on held-out views."""
     shots = load_dataset(scene).test
-    before, after, zero = measure_all(candidates, shots, engine=engine, repeats=_REPEATS)
+    before, after, zero = measure_all(candidates, shots, engine=settings.engine, repeats=_REPEATS)
     return {
         "before": before,
         "after": after,
@@ -205,6 +199,13 @@ def _measure(scene: Path, candidates: list[Candidate], engine: str) -> dict[str,
         "gaussians": after["gaussians"],
         "engine": after["engine"],
         "device": after["device"],
+        "iterations": summary.steps,
+        "train_seconds": summary.train_seconds,
+        "adapter": summary.adapter,
+        "seed": settings.seed,
+        "model_before": str(summary.model_before),
+        "model_after": str(summary.model_after),
+        "settings": summary.settings,
     }
 
 

@@ -158,7 +158,8 @@ def draw_panels(
                 output = candidate.draw(engine, shot.view, counts=True)
             assert output.fragments is not None
             shown.append((name, output.image))
-            heat.append((f"{name}: {output.fragments.float().mean():.1f}/px", output.fragments))
+            mean = float(output.fragments.float().mean())
+            heat.append((f"{name}: {mean:.1f}/px", output.fragments))
         files.append(out / f"{stem}_panel.png")
         save_panel(files[-1], shown + heat, max(float(each.max()) for _, each in heat))
     return files

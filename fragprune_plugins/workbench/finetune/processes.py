@@ -191,7 +191,7 @@ class Processes:
     def _summed(self, parts: Sequence[Tensor]) -> list[Tensor]:
         flat = torch.cat([part.reshape(-1) for part in parts])
         self.ranks.sum(flat)
-        pieces = flat.split([part.numel() for part in parts])
+        pieces = flat.split_with_sizes([part.numel() for part in parts])
         return [piece.view_as(part) for piece, part in zip(pieces, parts, strict=True)]
 
     def compare(self, tensors: Mapping[str, Tensor], step: int) -> None:
