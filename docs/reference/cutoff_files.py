@@ -31,7 +31,7 @@ from fragprune_plugins.constants import (
 )
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.workbench.models import cutoffs, formats
-from fragprune_plugins.workbench.models.formats.values import SH_C0, of_codes, splat_of
+from fragprune_plugins.workbench.models.formats.arrays import SH_C0, of_codes, splat_of
 from fragprune_plugins.workbench.scenes.pinhole import Camera
 
 WIDTH, HEIGHT, FOCAL = 128, 96, 120.0

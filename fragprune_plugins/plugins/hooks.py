@@ -26,17 +26,19 @@ if TYPE_CHECKING:
 
 
 def engine_for(
-    name: str, device: torch.device | str = "cpu", plugins: Plugins | None = None
+    name: str | Engine, device: torch.device | str = "cpu", plugins: Plugins | None = None
 ) -> Engine:
     """The engine with a name, for tensors on a device: a plugin's or our own. Created once.
 
     Args:
-        name: "auto", "reference", "cpu", "cuda", or a name that a plugin answers.
+        name: "auto", "reference", "cpu", "cuda", one that a plugin answers; or an engine, as it is.
 
     Raises:
         EngineError: the name is unknown, or the engine cannot run here.
         PluginError: a plugin raised, or its answer is not an engine.
     """
+    if not isinstance(name, str):
+        return name
     device, plugins = torch.device(device), plugins or installed()
     engine = plugins.engines.get((name, device))
     if engine is None:
@@ -80,7 +82,6 @@ def thresholds_for(
     Args:
         given: a store, for which plugins are asked unless it is neutral; or thresholds to use as
             they are.
-        plugins: the plugins to ask; None for those of the process.
 
     Raises:
         PluginError: a plugin raised, or its answer is not N thresholds in (0, 1).
@@ -114,9 +115,8 @@ def select_adapter(
 
 
 def _no_engine(answer: Any) -> Wrong | None:
-    fits = callable(getattr(answer, "rasterize", None)) and isinstance(
-        getattr(answer, "name", None), str
-    )
+    named = isinstance(getattr(answer, "name", None), str)
+    fits = named and callable(getattr(answer, "rasterize", None))
     return None if fits else (repr(answer), "an engine: a name, and rasterize(inputs, thresholds)")
 
 

@@ -59,10 +59,8 @@ def slice_at(splats: SpacetimeSplats, moment: Moment, *, engine: str | Engine = 
         EngineError: there is no such engine here, or a GPU cuts wrongly.
     """
     check_harmonics(splats, moment)
-    if isinstance(engine, str):
-        engine = create_engine(engine, splats.device)
     if not isinstance(engine, CpuEngine | CudaEngine | ReferenceEngine):
-        engine = create_engine("auto", splats.device)
+        engine = create_engine(engine if isinstance(engine, str) else "auto", splats.device)
     if isinstance(engine, CpuEngine):
         return slice_by(CpuKernels(engine.library, engine.workspace), splats, moment)
     if isinstance(engine, CudaEngine):

@@ -352,6 +352,11 @@ class Running:
         background = torch.zeros(3) if background is None else background
         return self.driver.render(camera, model, background)
 
+    def gradients(self, model: Any) -> dict[str, Tensor]:
+        """Of the trained tensors that have one, by the name of their param group."""
+        parameters = self.driver.parameters(model).items()
+        return {name: each.grad for name, each in parameters if each.grad is not None}
+
     def step(self, model: Any, camera: Any, iteration: int) -> float:
         """One iteration in the hosts' order; returns the loss."""
         return self.driver.step(model, camera, iteration, torch.zeros(3))

@@ -42,6 +42,10 @@ if TYPE_CHECKING:
 _SENT = ("means", "opacities", "scales", "rotations", "cov3d")
 """Attributes that are sent as they are; colours and thresholds go with them."""
 
+_SEEN, _POSE = ("width", "height", "tan_fov_x", "tan_fov_y"), ("viewmatrix", "projmatrix", "campos")
+_RULES = ("scale_modifier", "dilation", "near")
+"""What each process tells the others of its view and of its rules."""
+
 _WIDER, _BEYOND = 1.001, 1.0
 """How much farther a Gaussian is taken to reach, for rounding: a factor, and pixels."""
 
@@ -111,25 +115,17 @@ class ShardedEngine:
 
         If other processes have thresholds, and this one none, neutral ones are put into ``given``.
         """
-        view, cameras = inputs.view, ("viewmatrix", "projmatrix", "campos")
-        numbers = [view.width, view.height, view.tan_fov_x, view.tan_fov_y]
-        numbers += [inputs.scale_modifier, inputs.dilation, inputs.near]
+        view = inputs.view
         kinds = [  # absent, there, there with a gradient
             0 if (each := given.get(name)) is None else 1 + each.requires_grad
             for name in (*_SENT, "thresholds")
         ]
-        told = view.viewmatrix.new_tensor([*numbers, *kinds], dtype=torch.float64)
-        parts = [getattr(view, name).detach().to(told).reshape(-1) for name in cameras]
-        told = torch.cat([told, *parts])
-        table = told.new_zeros(self.ranks.size, len(told))
-        table[self.ranks.rank] = told
-        self.ranks.sum(table)
-        *heads, matrices, projections, centres = table.split_with_sizes(
-            [len(numbers), len(kinds), 16, 16, 3], 1
-        )
-        known = [[int(each) for each in row] for row in heads[1].tolist()]
-        cut = max(kind[-1] for kind in known)
-        for rank, kind in enumerate(known):
+        seen = {name: getattr(view, name) for name in _SEEN}
+        seen |= {name: getattr(view, name).detach().cpu() for name in _POSE}
+        rules = {name: getattr(inputs, name) for name in _RULES}
+        known = self.ranks.gather((kinds, seen, rules))
+        cut = max(kind[-1] for kind, _, _ in known)
+        for rank, (kind, _, _) in enumerate(known):
             if kind[:-1] != kinds[:-1] or kind[-1] not in (0, cut):
                 raise RanksError(
                     f"process {self.ranks.rank} of {self.ranks.size}",
@@ -140,22 +136,11 @@ class ShardedEngine:
         if cut and "thresholds" not in given:
             neutral = torch.full((len(inputs.splats),), NEUTRAL_LOGIT, device=inputs.splats.device)
             given["thresholds"] = neutral.sigmoid().requires_grad_(cut > 1)
-        found = []
-        for rank, row in enumerate(heads[0].tolist()):
-            width, height, tan_x, tan_y, modifier, dilation, near = row
-            seen = replace(
-                view,
-                width=int(width),
-                height=int(height),
-                tan_fov_x=tan_x,
-                tan_fov_y=tan_y,
-                viewmatrix=matrices[rank].to(view.viewmatrix).view(4, 4),
-                projmatrix=projections[rank].to(view.projmatrix).view(4, 4),
-                campos=centres[rank].to(view.campos),
-            )
-            rules = {"scale_modifier": modifier, "dilation": dilation, "near": near}
-            found.append(replace(inputs, view=seen, **rules))
-        return found
+        device = view.viewmatrix.device
+        return [
+            replace(inputs, view=replace(view, **seen).to(device), **rules)
+            for _, seen, rules in known
+        ]
 
     def _colors(self, splats: Splats, ids: Tensor, view: View) -> Tensor:
         """(M, 3) RGB of chosen Gaussians as a view sees them."""
@@ -175,12 +160,9 @@ class ShardedEngine:
 
     def _counts(self, rows: Sequence[Tensor]) -> tuple[list[int], list[int]]:
         """How many Gaussians this process sends to each, and gets of each."""
-        to = [len(ids) for ids in rows]
-        self.sent += sum(to) - to[self.ranks.rank]
-        table = rows[0].new_zeros(self.ranks.size, self.ranks.size)
-        table[self.ranks.rank] = table.new_tensor(to)
-        self.ranks.sum(table)
-        return to, table[:, self.ranks.rank].tolist()
+        to, rank = [len(ids) for ids in rows], self.ranks.rank
+        self.sent += sum(to) - to[rank]
+        return to, [counts[rank] for counts in self.ranks.gather(to)]
 
     def _exchange(
         self, parts: Mapping[str, Tensor], to: list[int], by: list[int]
@@ -225,7 +207,6 @@ def reaching(inputs: RasterInputs, splats: Splats, thresholds: Tensor | None) ->
 
     Args:
         inputs: the view and its rules; its Gaussians are not used.
-        splats: N Gaussians.
         thresholds: (N,) falloff, or None.
     """
     view, means = inputs.view, splats.means
@@ -287,11 +268,7 @@ def _expect_sendable(inputs: RasterInputs) -> Splats:
 
 
 class Shards(Processes):
-    """Processes that each hold a part of the model's Gaussians.
-
-    Args:
-        count: of this process' Gaussians.
-    """
+    """Processes that each hold a part of the model's Gaussians; this one holds ``count``."""
 
     divided = True
 

@@ -54,8 +54,7 @@ def keep_best(
     Raises:
         InputError: the share is not in (0, 1].
     """
-    score = removal_error if score is None else score
-    drawer = _drawer(engine, model)
+    score, drawer = score or removal_error, engine_for(engine, model.device)
     scores = score(model, model.falloff, _bar(views, progress), drawer)
     return model.keep(best(scores, share))
 
@@ -81,7 +80,7 @@ def keep_needed(
         progress: draw a bar on stderr.
     """
     thresholds = model.falloff
-    drawer, splats, error = _drawer(engine, model), model.splats(), 0.0
+    drawer, splats, error = engine_for(engine, model.device), model.splats(), 0.0
     with torch.no_grad():
         for shot in shots:
             inputs = RasterInputs(shot.view, splats, planes=(), **model.rules)
@@ -137,26 +136,14 @@ def removal_error(
     return scores.detach()
 
 
-def _drawer(engine: str | Engine, model: Model) -> Engine:
-    return engine_for(engine, model.device) if isinstance(engine, str) else engine
-
-
 def _bar(views: Sequence[View], progress: bool) -> Iterable[View]:
-    """The views, with a bar that shows how far they have been scored."""
-
-    bar: Iterable[View] = tqdm(
-        views, "scoring Gaussians", unit="view", leave=None, disable=not progress
-    )
+    what = "scoring Gaussians"
+    bar: Iterable[View] = tqdm(views, what, unit="view", leave=None, disable=not progress)
     return bar
 
 
 @torch.no_grad()
-def visible(
-    model: Model,
-    views: Sequence[View] = (),
-    *,
-    engine: str | Engine = "auto",
-) -> Tensor:
+def visible(model: Model, views: Sequence[View] = (), *, engine: str | Engine = "auto") -> Tensor:
     """(N,) bool: the Gaussians whose removal could change a picture.
 
     Without views, these are the Gaussians with an opacity of 1/255 or more. With views, these are
@@ -175,7 +162,7 @@ def visible(
     splats = model.splats()
     seen = splats.opacities >= ALPHA_MIN
     if views:
-        drawer = engine_for(engine, splats.device) if isinstance(engine, str) else engine
+        drawer = engine_for(engine, splats.device)
         seen = torch.zeros_like(seen)
         for view in views:
             # Alpha capped at its least cuts and hides no Gaussian: light is left behind two

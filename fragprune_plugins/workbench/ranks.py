@@ -33,6 +33,8 @@ _PIECE = 1 << 22  # numbers of a tensor that are summed at once
 class Ranks:
     """All processes of one learning, seen from one of them; by default there is one.
 
+    What they do together raises RanksError if another process is gone.
+
     Attributes:
         rank: of this process, from 0.
     """
@@ -55,11 +57,7 @@ class Ranks:
         return views[self.rank :: self.size]
 
     def sum(self, tensor: torch.Tensor) -> None:
-        """Add up a tensor over all processes, in place; each gets the same bits.
-
-        Raises:
-            RanksError: another process is gone.
-        """
+        """Add up a tensor over all processes, in place; each gets the same bits."""
         import torch.distributed as dist
 
         if self.several:
@@ -76,9 +74,6 @@ class Ranks:
 
         Returns:
             What this process gets, that of the first process first.
-
-        Raises:
-            RanksError: another process is gone.
         """
         import torch.distributed as dist
 
@@ -90,11 +85,7 @@ class Ranks:
         return received
 
     def gather(self, value: Any) -> list[Any]:
-        """A plain value of each process, by rank.
-
-        Raises:
-            RanksError: another process is gone.
-        """
+        """A plain value of each process, by rank."""
         import torch.distributed as dist
 
         if not self.several:
@@ -105,11 +96,7 @@ class Ranks:
         return values
 
     def agree(self, what: Mapping[str, Any], where: str) -> None:
-        """Check that all processes have the same values by the same names.
-
-        Raises:
-            RanksError: they differ, in every process; or another process is gone.
-        """
+        """Raise RanksError, in every process, unless all have the same values by the same names."""
         known = self.gather(dict(what))
         for rank, other in enumerate(known):
             names = known[0].keys() | other.keys()
@@ -166,13 +153,6 @@ def joined(device: torch.device) -> Iterator[Ranks]:
     import torch
     import torch.distributed as dist
 
-    if not dist.is_available():
-        raise RanksError(
-            "learning",
-            f"{ranks.size} processes, and a torch that was built without torch.distributed",
-            "a torch with it",
-            "Install the torch of pytorch.org, or start one process.",
-        )
     # Its functions have the group as a default, of the time of their import: imported later, as by
     # an optimizer, they would keep the group and its threads alive until Python is gone, and a
     # thread that then frees a tensor aborts the process.

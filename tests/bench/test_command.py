@@ -7,7 +7,7 @@ import pytest
 from cli.commands import run, run_json
 from finetune import tiny
 
-from fragprune_plugins.workbench.bench import work
+from fragprune_plugins.workbench.bench import timing, work
 from fragprune_plugins.workbench.models.formats.ply import write_ply
 
 SMALL = ("--size", "40x30", "--gaussians", 200)
@@ -75,7 +75,7 @@ def test_a_model_of_ones_own_with_its_thresholds(tmp_path: Path, learned: bool) 
     plain, cut = (row["fragments_per_pixel"] for row in rows if row["pass"] == "forward")
     assert plain > cut > 0
     assert (cut < 0.5 * plain) == learned
-    assert work.TRUNCATION < 0.1
+    assert timing.TRUNCATION < 0.1
 
 
 @pytest.mark.parametrize("arguments", [("--size", "40"), ("--size", "0x9")])

@@ -16,9 +16,10 @@ from fragprune_plugins.workbench.scenes.generated import (
     beside,
     between,
     bounds,
-    hold_out,
     interpolate,
+    own_pictures,
 )
+from fragprune_plugins.workbench.scenes.posed import hold_out
 
 NUMBER = st.floats(-3, 3, width=32)
 PLACE = st.tuples(NUMBER, NUMBER, NUMBER)
@@ -158,5 +159,9 @@ def test_one_in_eight_is_held_out():
     learned, held = hold_out(list(range(20)))
     assert held == [0, 8, 16]
     assert sorted(learned + held) == list(range(20))
+
+
+def test_one_camera_is_too_few():
+    model = tiny.random_model()
     with pytest.raises(DatasetError, match="at least two"):
-        hold_out([1])
+        own_pictures(model, around(model, 1))

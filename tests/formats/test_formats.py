@@ -20,8 +20,8 @@ from fragprune_plugins.errors import FragpruneError, ModelFileError, OutputError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.workbench.models import cutoffs, formats
+from fragprune_plugins.workbench.models.formats.arrays import morton_order, turned
 from fragprune_plugins.workbench.models.formats.ply import write_ply
-from fragprune_plugins.workbench.models.formats.values import morton_order, turned
 
 # Half a step of each format's own quantisation, with the values that ``random_splat`` has.
 # xyz lie within 8 (16 across), colours within 0.5 +- 0.43, log scales within -7 to 1.

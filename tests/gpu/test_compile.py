@@ -49,9 +49,9 @@ def check(image: kernels.Image) -> None:
     found = resources(image.log)
     assert found
     for name, needs in found.items():
-        assert (needs.stack, needs.spills) == (0, 0), (name, needs)
-        assert needs.registers <= REGISTERS.get(name, OTHERS), (name, needs)
-        assert needs.shared <= 48 << 10, (name, needs)
+        assert (needs["stack"], needs["spills"]) == (0, 0), (name, needs)
+        assert needs["registers"] <= REGISTERS.get(name, OTHERS), (name, needs)
+        assert needs["shared"] <= 48 << 10, (name, needs)
 
 
 @pytest.mark.parametrize("architecture", ARCHITECTURES)

@@ -13,7 +13,7 @@ from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.workbench.figures.viewing import overview
 from fragprune_plugins.workbench.models import formats
-from fragprune_plugins.workbench.models.formats.values import morton_order
+from fragprune_plugins.workbench.models.formats.arrays import morton_order
 from fragprune_plugins.workbench.view.packing import compact, pack
 from fragprune_plugins.workbench.view.site import Layer, compacted, make_site
 

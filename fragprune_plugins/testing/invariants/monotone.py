@@ -73,10 +73,7 @@ def _no_trace(case: Case) -> None:
             fixed.values = tau.requires_grad_()
             package = host.render(camera, model)
             package["render"].square().sum().backward()
-            gradients = {
-                n: p.grad for n, p in host.driver.parameters(model).items() if p.grad is not None
-            }
-            results.append((package["render"].detach(), gradients))
+            results.append((package["render"].detach(), host.gradients(model)))
     (image, gradients), (without, expected) = results
     torch.testing.assert_close(image, without, rtol=0, atol=1e-6)
     for name, gradient in gradients.items():

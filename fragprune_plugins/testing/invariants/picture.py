@@ -43,12 +43,9 @@ def same_picture(case: Case) -> str:
                 ours, _ = _drawn_by(case, name, seed, same)
                 truth, _ = _drawn_by(case, "reference", seed, same)
             for key, expected in truth.items():
-                limit = IMAGE_TOLERANCE if key == "picture" else GRADIENT_TOLERANCE
-                scale = (
-                    max(1.0, float(expected.abs().max()))
-                    if key == "picture"
-                    else (float(expected.abs().max()) + 1e-3)
-                )
+                limit, scale = GRADIENT_TOLERANCE, float(expected.abs().max()) + 1e-3
+                if key == "picture":
+                    limit, scale = IMAGE_TOLERANCE, max(1.0, float(expected.abs().max()))
                 away = float((ours[key] - expected).abs().max()) / scale
                 require(away < limit, f"{name}: {key} differs by {away:.2g}, more than {limit:g}")
     return f"{', '.join(others)} against the reference: {len(truth) - 1} gradients, 3 scenes"
@@ -73,9 +70,6 @@ def _drawn_by(
         mask = torch.ones_like(drawn.fragments, dtype=torch.bool) if mask is None else mask
         weights = Chance(seed, 0.5).uniform(*image.shape) - 0.5
         (image * weights * mask).sum().backward()
-        gradients = {
-            f"gradient of {n}": p.grad
-            for n, p in (*host.driver.parameters(model).items(), ("thresholds", store.logits))
-            if p.grad is not None
-        }
+        found = host.gradients(model) | {"thresholds": store.logits.grad}
+        gradients = {f"gradient of {name}": each for name, each in found.items()}
     return {"picture": (image * mask).detach(), **gradients}, drawn.fragments

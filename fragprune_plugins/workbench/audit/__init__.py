@@ -6,21 +6,16 @@ from typing import Any
 
 import click
 
+from fragprune_plugins.workbench.commands import options as shared
 from fragprune_plugins.workbench.commands.command import Command, Report, work_of
-from fragprune_plugins.workbench.commands.options import (
-    CAMERAS_APART,
-    CAMERAS_HELP,
-    FILE,
-    MODEL,
-    engine_options,
-    truncation_option,
+
+
+@click.command("audit", cls=Command, rules=[shared.CAMERAS_APART])
+@click.argument("model", type=shared.MODEL)
+@click.option("--cameras", type=shared.FILE, help=f"{shared.CAMERAS_HELP}, if there is one.")
+@click.option(
+    "--data", type=shared.FILE, help="Scene folder whose cameras look; no image is needed."
 )
-
-
-@click.command("audit", cls=Command, rules=[CAMERAS_APART])
-@click.argument("model", type=MODEL)
-@click.option("--cameras", type=FILE, help=f"{CAMERAS_HELP}, if there is one.")
-@click.option("--data", type=FILE, help="Scene folder whose cameras look; no image is needed.")
 @click.option(
     "--orbit/--inside", default=None, help="Generate cameras all around it, or inside of it."
 )
@@ -31,15 +26,15 @@ from fragprune_plugins.workbench.commands.options import (
     show_default=True,
     help="Cameras to generate, or to take evenly from the given ones, at most.",
 )
-@click.option("--out", type=FILE, help="Folder for audit.html, audit.json and maps.")
+@click.option("--out", type=shared.FILE, help="Folder for audit.html, audit.json and maps.")
 @click.option(
     "--resolution",
     type=click.IntRange(1, 16),
     help="Divide the pictures' sides by this; default: until they have 1,600 pixels or less.",
 )
 @click.option("--white-background", is_flag=True, help="Draw over white, with given cameras.")
-@truncation_option
-@engine_options()
+@shared.truncation_option
+@shared.engine_options()
 def command(**options: Any) -> Report:
     """Measure what MODEL costs to draw, and how much of that changes nothing. No photograph needed.
 

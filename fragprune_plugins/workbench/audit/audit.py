@@ -27,15 +27,8 @@ from fragprune_plugins.engines.fragments import fragments
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.schedule import USUAL_STOP
 from fragprune_plugins.types import View, one_line
+from fragprune_plugins.workbench.figures import extents
 from fragprune_plugins.workbench.figures.evaluate import Candidate, frame_times
-from fragprune_plugins.workbench.figures.extents import (
-    CUTS,
-    SQRT8,
-    VIEWERS,
-    covered,
-    honouring,
-    shaded,
-)
 from fragprune_plugins.workbench.figures.metrics import psnr
 from fragprune_plugins.workbench.scenes.generated import Named
 
@@ -76,15 +69,11 @@ _COUNTS = ("fragments_per_pixel", "evaluated_per_pixel")
 
 @dataclass
 class Idle:
-    """Counts of weighed fragments.
+    """Counts of weighed fragments: drawn at some pixels, and of them idle alone and together.
 
     Attributes:
-        pixels: that were looked at.
-        drawn: fragments there.
-        alone: of them, those idle alone.
-        together: of them, those idle together.
         weight: of those idle together, sum; a pixel has 1 at most.
-        classes: (2, 3, 3) drawn, and idle together, by opacity and radius.
+        classes: (2, 9) drawn, and idle together, by opacity and radius.
         reasons: (2, 4) likewise by ``REASONS``.
     """
 
@@ -139,8 +128,7 @@ class Weighed:
     Attributes:
         drawn: whether there is a fragment.
         weights: T alpha.
-        alone: whether it is idle alone.
-        together: whether it is idle together.
+        alone, together: whether it is idle.
         reasons: index into ``REASONS``.
     """
 
@@ -254,35 +242,27 @@ class _Survey:
         self._radii = torch.empty(0)
 
     def draw(self, name: str, view: View, shown: bool) -> None:
-        """Draw a view of the model and of its cuts.
-
-        Args:
-            shown: pictures show it, and frames of it are timed.
-        """
+        """Draw a view of the model and of its cuts; if ``shown``, pictures show it."""
         engine, opacities, itself = self._engine, self._itself.splats.opacities, None
         for label, candidate in self.candidates.items():
             out = candidate.draw(engine, view, counts=itself is None)
             itself = out if itself is None else itself
             error = (out.image.clamp(0, 1) - itself.image.clamp(0, 1)).square().mean()
-            row = {
-                "mse": float(error),
-                "psnr": psnr(out.image, itself.image),
-            }
-            row |= {key: float(getattr(out, key)) for key in _COUNTS}
-            self._rows[label].append(row)
+            counts = {key: float(getattr(out, key)) for key in _COUNTS}
+            psnr_itself = psnr(out.image, itself.image)
+            self._rows[label].append({"mse": float(error), "psnr": psnr_itself, **counts})
         assert itself is not None
         self._radii = itself.radii
         inputs = self._itself.inputs(view)
-        squared = SQRT8.squared(opacities)
-        ellipses = covered(engine, replace(inputs, counts=True), squared)
+        squared = extents.SQRT8.squared(opacities)
+        ellipses = extents.covered(engine, replace(inputs, counts=True), squared)
         self._overdraw.append(float(ellipses.fragments_per_pixel))
-        for viewer in VIEWERS:
-            self._asked.setdefault(viewer.names, []).append(shaded(engine, inputs, viewer))
+        for viewer in extents.VIEWERS:
+            self._asked.setdefault(viewer.names, []).append(extents.shaded(engine, inputs, viewer))
         cut = self._itself.thresholds(inputs)
         if cut is not None:
-            reach = honouring(cut, opacities)
-            quads = 4 / math.pi * float(covered(engine, inputs, reach).fragments_per_pixel)
-            self._asked.setdefault(HONOURING, []).append(quads)
+            reach = extents.honouring(cut, opacities)
+            self._asked.setdefault(HONOURING, []).append(extents.quads(engine, inputs, reach))
         if shown:
             assert itself.fragments is not None
             assert ellipses.fragments is not None
@@ -342,7 +322,7 @@ def _candidates(model: Model) -> dict[str, Candidate]:
     """The model as it is, first, and with every cut on top."""
     itself, own = Candidate(model), model.falloff
     found = {AS_IT_IS: itself}
-    for cut in CUTS:
+    for cut in extents.CUTS:
         thresholds = cut.thresholds(itself.splats.opacities)
         thresholds = thresholds if own is None else torch.maximum(own, thresholds)
         found[cut.name] = itself.sharing(cut=thresholds)
@@ -363,10 +343,10 @@ def _mean(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 
 
 def _viewers(asked: Mapping[str, Sequence[float]]) -> list[dict[str, Any]]:
-    rules = {viewer.names: (viewer.extent.name, viewer.shape) for viewer in VIEWERS}
+    rules = {viewer.names: (viewer.extent.name, viewer.shape) for viewer in extents.VIEWERS}
     rules[HONOURING] = ("quads by cutoffs, 1/255", "quad")
     means = {names: statistics.fmean(pixels) for names, pixels in asked.items()}
-    first = means[VIEWERS[0].names]
+    first = means[extents.VIEWERS[0].names]
     return [
         {
             "viewers": names,

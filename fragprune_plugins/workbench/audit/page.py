@@ -73,8 +73,7 @@ def sentence(figures: Mapping[str, Any]) -> str:
         f"{figures['engine']} engine; a "
         f"viewer of fixed √8 sigma quads shades {quads:.1f} pixels per pixel. "
         f"{idle['together']:.0%} of the fragments can be left out together, and no pixel "
-        f"changes by half an 8-bit level "
-        f"({figures['views']} {cameras})."
+        f"changes by half an 8-bit level ({figures['views']} {cameras})."
     )
 
 
@@ -116,9 +115,8 @@ def _folded(table: page.Table) -> list[str]:
         ]
         for row in (table.head, *table.rows)
     ]
-    widths = [
-        max(len(line) for cell in column for line in cell) for column in zip(*rows, strict=True)
-    ]
+    columns = zip(*rows, strict=True)
+    widths = [max(len(line) for cell in column for line in cell) for column in columns]
     lines = []
     for row in rows:
         for parts in zip_longest(*row, fillvalue=""):
@@ -175,35 +173,21 @@ def _tables(figures: Mapping[str, Any]) -> list[page.Table]:
         "error over all views."
     )
     quads = figures["viewers"][0]["shaded_per_pixel"]
-    viewers = [
-        [
-            each["viewers"],
-            each["rule"],
-            f"{each['shaded_per_pixel']:.1f}",
-            f"{each['against_sqrt8']:.2f}",
-        ]
-        for each in figures["viewers"]
+    ours = figures["evaluated_per_pixel"]
+    shading = [
+        *(
+            (each["viewers"], each["rule"], each["shaded_per_pixel"], each["against_sqrt8"])
+            for each in figures["viewers"]
+        ),
+        ("fragprune", _OURS, ours, ours / max(quads, 1e-9)),
     ]
-    viewers.append(
-        [
-            "fragprune",
-            "tiles by ellipse, 1/255 or cutoff; ends where opaque",
-            f"{figures['evaluated_per_pixel']:.1f}",
-            f"{figures['evaluated_per_pixel'] / max(quads, 1e-9):.2f}",
-        ]
-    )
+    viewers = [[name, rule, f"{some:.1f}", f"{share:.2f}"] for name, rule, some, share in shading]
     shaded = f"{_SHADED} Its frames of {figures['frame_size']} take {figures['frame_ms']:.1f} ms."
+    every = {"name": "all", "share": 1.0, "idle": idle["together"]}
     reasons = [
-        [
-            each["name"],
-            f"{each['share']:.1%}",
-            f"{each['idle']:.1%}",
-            _part(each["idle"], each["share"]),
-        ]
-        for each in idle["reasons"]
+        [each["name"], f"{each['share']:.1%}", f"{each['idle']:.1%}", _part(each)]
+        for each in (*idle["reasons"], every)
     ]
-    every, together = 1.0, idle["together"]
-    reasons.append(["all", f"{every:.1%}", f"{together:.1%}", _part(together, every)])
     return [
         page.Table(head, cuts, said),
         page.Table(["viewer", "draws", "shaded/pixel", "against √8 quads"], viewers, shaded, 2),
@@ -226,8 +210,8 @@ def _kinds(idle: Mapping[str, Any]) -> page.Table:
     return page.Table(["Gaussians", *(f"radius {name}" for name in radii)], rows, _KINDS_SAID)
 
 
-def _part(some: float, every: float) -> str:
-    return f"{some / every:.0%}" if every else ""
+def _part(reason: Mapping[str, Any]) -> str:
+    return f"{reason['idle'] / reason['share']:.0%}" if reason["share"] else ""
 
 
 def _decibels(value: float | None) -> str:
@@ -253,6 +237,8 @@ _REASONS = f"""Each fragment counts where the first of these holds. Behind what 
 
 _KINDS_SAID = """Share of all fragments, and in brackets of those idle together. The radius is 3
 sigma, on the screen."""
+
+_OURS = "tiles by ellipse, 1/255 or cutoff; ends where opaque"
 
 _SHADED = """Quads: their area. Tiles: the pixels of all (Gaussian, tile) pairs; tiles that are
 opaque early spare some. The last row is counted by our engine, with what it spares."""

@@ -10,9 +10,8 @@ is closed all round looks like a room: then choose.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from scipy.spatial import cKDTree
@@ -31,6 +30,7 @@ Side = Literal["auto", "orbit", "inside"]
 ENCLOSED = 0.5
 """Share of directions that end on a surface from which on a place is inside."""
 
+_AS_ASKED = "As asked for."
 _CANDIDATES = 12
 _PLACES = 4  # that cameras stand at, at most
 _AS_GOOD = 0.8  # of the best place's share
@@ -69,18 +69,15 @@ def place(
     """Cameras all around a splat, or inside of it.
 
     Args:
-        count: cameras.
         engine: draws small pictures to choose by.
-        side: where they go.
         divide: divisor of the sides of their pictures, which have 800 pixels.
     """
     pixels = 800 // divide
     if side == "orbit":
-        return Placed(_orbit(splat, count, pixels, engine), side, "As asked for.", math.nan)
+        return Placed(_orbit(splat, count, pixels, engine), side, _AS_ASKED, math.nan)
     splats, near = splat.splats(), _NEAR * bounds(splat)[1]
     places = _clear(splat, near / _NEAR)
-    looked = bar(places, "looking from inside")
-    shares = [enclosed(engine, splats, at, near) for at in looked]
+    shares = [enclosed(engine, splats, at, near) for at in bar(places, "looking from inside")]
     best = max(shares)
     if side == "auto" and best <= ENCLOSED:
         why = (
@@ -89,17 +86,15 @@ def place(
             "If it is a room, pass --inside."
         )
         return Placed(_orbit(splat, count, pixels, engine), "orbit", why, best)
-    good = [at for at, share in zip(places, shares, strict=True) if share >= _AS_GOOD * best]
-    eyes = good[:_PLACES]  # the most open ones
-    if side == "inside":
-        why = "As asked for."
-    else:
+    why = _AS_ASKED
+    if side == "auto":
         why = (
             f"This looks like a room: from the best place inside, {best:.0%} of all directions end "
             f"on a distant surface, and outside an object at most {ENCLOSED:.0%} do. If it is a "
             "hollow object, pass --orbit."
         )
-    views = within(eyes, 2 * count, pixels=pixels)
+    good = [at for at, share in zip(places, shares, strict=True) if share >= _AS_GOOD * best]
+    views = within(good[:_PLACES], 2 * count, pixels=pixels)  # from the most open ones
     small = bar([_small(view) for _, view in views], "choosing cameras")
     seen = [float(_met(engine, splats, view, near).mean()) for view in small]
     half = sorted(seen, reverse=True)[count - 1]  # doors and open sides show nothing
@@ -114,8 +109,7 @@ def _orbit(splat: Model, count: int, pixels: int, engine: Engine) -> Named:
     """
     centre, splats = bounds(splat)[0], splat.splats()
     named = around(splat, count, pixels=pixels)
-    looked = bar(named, "choosing cameras")
-    details = {name: _detail(engine, splats, view) for name, view in looked}
+    details = {n: _detail(engine, splats, view) for n, view in bar(named, "choosing cameras")}
     return sorted(named, key=lambda each: (bool(each[1].campos[1] > centre[1]), -details[each[0]]))
 
 
@@ -137,7 +131,6 @@ def _small(view: View) -> View:
 
 def _clear(splat: Model, radius: float) -> list[Tensor]:
     """Places of a grid far from all but faint Gaussians and from each other, farthest first."""
-
     means = splat.xyz.detach().cpu()
     means = means[:: max(1, len(means) // _SAMPLED)]
     ends = torch.quantile(means, torch.tensor([_BOX, 1 - _BOX]), dim=0)
@@ -162,8 +155,6 @@ def enclosed(engine: Engine, splats: Splats, place: Tensor, near: float) -> floa
     of the camera, however thin, brings it near.
 
     Args:
-        engine: draws six pictures, one to each side.
-        splats: N Gaussians.
         place: (3,).
         near: the distance, world units.
     """
@@ -178,19 +169,11 @@ def _met(engine: Engine, splats: Splats, view: View, near: float) -> Tensor:
     return ((out.alpha > _OPAQUE) & (out.alpha > near * out.invdepth)).flatten().float().cpu()
 
 
-def _faces(place: Tensor) -> Sequence[View]:
+def _faces(place: Tensor) -> list[View]:
     """Six square views that together see everything."""
     eye = place.double().cpu()
-    return [
-        look_at(
-            eye,
-            eye + torch.tensor(ahead, dtype=torch.float64),
-            width=_PIXELS,
-            height=_PIXELS,
-            fov_y=90,
-        )
-        for ahead in _AHEAD
-    ]
+    square: dict[str, Any] = {"width": _PIXELS, "height": _PIXELS, "fov_y": 90}
+    return [look_at(eye, eye + eye.new_tensor(ahead), **square) for ahead in _AHEAD]
 
 
 def _solid_angles() -> Tensor:

@@ -11,16 +11,18 @@ from __future__ import annotations
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.types import View
+from fragprune_plugins.workbench.models.formats.arrays import SH_C0
 
 SEED = 20240607
 _TAN = (0.66, 0.50)  # half extents of the filled frustum at depth 1
-_POSE_DEGREES = (12.0, -25.0, 4.0)
+_ROTATION = Rotation.from_euler("xyz", (12.0, -25.0, 4.0), degrees=True).as_matrix()
+"""World to camera."""
 _TRANSLATION = np.array([0.3, -0.2, 0.5])
 _HALF_WIDTH = 0.60  # horizontal half tangent of the camera
-_SH_C0 = 0.28209479177387814
 
 Array = NDArray[np.float64]
 
@@ -34,26 +36,18 @@ def make_scene(count: int = 100_000, seed: int = SEED) -> Model:
     """
     rng = np.random.default_rng(seed)
     camera_space = _positions(rng, count)
-    world = (camera_space - _TRANSLATION) @ _rotation()
+    world = (camera_space - _TRANSLATION) @ _ROTATION
     size = np.log(0.0105 * camera_space[:, 2].clip(1.0) ** 0.75)
     size = size + 0.62 * rng.standard_normal(count)
-    scaling = np.stack(
-        [
-            size + 0.40 * rng.standard_normal(count),
-            size + 0.40 * rng.standard_normal(count),
-            size - 1.6 + 0.7 * rng.standard_normal(count),
-        ],
-        axis=1,
-    )
+    wide = [size + 0.40 * rng.standard_normal(count) for _ in range(2)]
+    short = size - 1.6 + 0.7 * rng.standard_normal(count)
+    scaling = np.stack([*wide, short], axis=1)
     rotation = rng.standard_normal((count, 4))
     rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
     rotation *= rng.uniform(0.7, 1.4, (count, 1))  # trained files hold unnormalised quaternions
     faint = rng.random(count) < 0.45
-    opacity = np.where(
-        faint,
-        -2.75 + 0.75 * rng.standard_normal(count),
-        2.6 + 1.2 * rng.standard_normal(count),
-    )
+    low, high = (a + b * rng.standard_normal(count) for a, b in ((-2.75, 0.75), (2.6, 1.2)))
+    opacity = np.where(faint, low, high)
     weights = rng.standard_normal((3, 3)) * 0.9
     rgb = 0.5 + 0.33 * np.sin(world @ weights + np.array([0.0, 2.0, 4.0]))
     rgb = rgb + 0.07 * rng.standard_normal((count, 3))
@@ -66,7 +60,7 @@ def make_scene(count: int = 100_000, seed: int = SEED) -> Model:
 
     return Model(
         xyz=tensor(world),
-        f_dc=tensor((rgb.clip(0.02, 0.98) - 0.5)[:, None] / _SH_C0),
+        f_dc=tensor((rgb.clip(0.02, 0.98) - 0.5)[:, None] / SH_C0),
         f_rest=tensor(rest.transpose(0, 2, 1)),
         opacity=tensor(opacity[:, None]),
         scaling=tensor(scaling),
@@ -78,28 +72,13 @@ def make_view(width: int, height: int) -> View:
     """The one camera of the scene at a given size; black background."""
     focal = width / (2 * _HALF_WIDTH)
     return View.pinhole(
-        torch.from_numpy(_rotation()).float(),
+        torch.from_numpy(_ROTATION).float(),
         torch.from_numpy(_TRANSLATION).float(),
         width=width,
         height=height,
         fx=focal,
         fy=focal,
     )
-
-
-def _rotation() -> Array:
-    """World to camera."""
-    pitch, yaw, roll = np.deg2rad(_POSE_DEGREES)
-
-    def turn(axis: int, angle: float) -> Array:
-        matrix = np.eye(3)
-        i, j = [(1, 2), (2, 0), (0, 1)][axis]
-        matrix[i, i] = matrix[j, j] = np.cos(angle)
-        matrix[j, i] = np.sin(angle)
-        matrix[i, j] = -matrix[j, i]
-        return matrix
-
-    return turn(2, roll) @ turn(1, yaw) @ turn(0, pitch)
 
 
 def _positions(rng: np.random.Generator, count: int) -> Array:

@@ -7,8 +7,9 @@ import platform
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -19,6 +20,10 @@ from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View, o
 from fragprune_plugins.workbench.figures.clock import standard_error, synchronize, timed
 
 Pass = Literal["forward", "forward_backward"]
+PASSES: tuple[Pass, ...] = get_args(Pass)
+
+TRUNCATION = 16 / 255
+"""Threshold of all Gaussians in truncated rows; leaves 0.63 of the fragments, as learning does."""
 
 
 @dataclass(frozen=True)
@@ -74,12 +79,7 @@ def measure(
     jobs = [(case, engine, _prepare(case, engine)) for case in cases for engine in engines]
     times: list[list[float]] = [[] for _ in jobs]
     stages: list[list[dict[str, float]]] = [[] for _ in jobs]
-    last: list[RasterOutputs] = []
-    peaks = []
-    for case, _, job in jobs:
-        outputs, peak = _with_peak(job, case.device)
-        last.append(outputs)
-        peaks.append(peak)
+    first = [_with_peak(job, case.device) for case, _, job in jobs]
     for turn in range(repeats):
         order = range(len(jobs)) if turn % 2 == 0 else reversed(range(len(jobs)))
         for index in order:
@@ -93,9 +93,10 @@ def measure(
         say(f"round {turn + 1} of {repeats}")
     results = []
     for index, (case, engine, _) in enumerate(jobs):
-        first = last[index - index % len(engines)]
+        outputs, peak = first[index]
+        compared, _ = first[index - index % len(engines)]
         median = statistics.median(times[index])
-        drawn = float(last[index].fragments_per_pixel.detach())
+        drawn = float(outputs.fragments_per_pixel.detach())
         fragments = drawn * case.view.width * case.view.height
         results.append(
             {
@@ -109,7 +110,7 @@ def measure(
                 "threads": torch.get_num_threads(),
                 "truncated": case.thresholds is not None,
                 "fragments_per_pixel": drawn,
-                "evaluated_per_pixel": last[index].evaluated_per_pixel,
+                "evaluated_per_pixel": outputs.evaluated_per_pixel,
                 "ms_median": median,
                 "ms_min": min(times[index]),
                 "ms_se": standard_error(times[index]),
@@ -118,8 +119,8 @@ def measure(
                     name: statistics.median(part[name] for part in stages[index])
                     for name in stages[index][0]
                 },
-                "peak_mb": peaks[index],
-                "difference": float((last[index].image - first.image).detach().abs().mean()),
+                "peak_mb": peak,
+                "difference": float((outputs.image - compared.image).detach().abs().mean()),
             }
         )
     return results
@@ -171,13 +172,7 @@ def _prepare(case: Case, engine: Engine) -> Callable[[], RasterOutputs]:
     """Make a function that draws once, optionally with gradients of a fixed random loss."""
     inputs = RasterInputs(case.view, case.splats, planes=(), **case.rules)
     if case.kind == "forward":
-
-        @torch.no_grad()
-        def draw() -> RasterOutputs:
-            return engine.rasterize(inputs, case.thresholds)
-
-        return draw
-
+        return torch.no_grad()(partial(engine.rasterize, inputs, case.thresholds))
     names = ("means", "opacities", "scales", "rotations", "sh")
     leaves = {n: getattr(case.splats, n).detach().clone().requires_grad_(True) for n in names}
     hook = torch.zeros(len(case.splats), 3, device=case.device, requires_grad=True)

@@ -14,29 +14,16 @@ from torch import Tensor
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.plugins.hooks import thresholds_for
 from fragprune_plugins.types import RasterInputs, Splats, View
+from fragprune_plugins.workbench.bench import timing
 from fragprune_plugins.workbench.bench.scene import make_scene, make_view
-from fragprune_plugins.workbench.bench.timing import (
-    Case,
-    Pass,
-    describe_machine,
-    load_average,
-    measure,
-    scaling,
-    translation,
-)
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import cameras_of, open_engine
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
 
-TRUNCATION = 16 / 255
-"""Threshold of all Gaussians in truncated rows; leaves 0.63 of the fragments, as learning does."""
-
 REPEATS = 9
 """Timed frames of each row."""
-
-_KINDS: tuple[Pass, ...] = ("forward", "forward_backward")
 
 Size = tuple[int, int]
 
@@ -54,24 +41,22 @@ def bench(
 ) -> Report:
     """Do what ``fragprune bench`` promises; its options are the arguments."""
     rasterizer, device = open_engine(engine)
-    before = load_average()
+    before = timing.load_average()
     scenes = (
         _generated(gaussians, sizes, device)
         if model is None
         else _of_model(model, cameras, sizes, device)
     )
     cases = [
-        case
-        for name, splats, view, cut, rules in scenes
-        for kind in _KINDS
-        for case in (
-            Case(name, view, splats, kind),
-            Case(name, view, splats, kind, cut, rules),
-        )
+        timing.Case(name, view, splats, kind, *cut)
+        for name, splats, view, *truncation in scenes
+        for kind in timing.PASSES
+        for cut in ((), truncation)
     ]
-    results = measure(cases, [rasterizer], repeats=REPEATS, say=partial(click.echo, err=True))
-    machine = describe_machine(device) | {"load_before": before, "load_after": load_average()}
-    saved = translation(results, rasterizer.name)
+    say = partial(click.echo, err=True)
+    results = timing.measure(cases, [rasterizer], repeats=REPEATS, say=say)
+    loads = {"load_before": before, "load_after": timing.load_average()}
+    saved = timing.translation(results, rasterizer.name)
     one_scene = len({row["scene"] for row in results}) == 1
     data = {
         "results": results,
@@ -79,8 +64,8 @@ def bench(
             key.split()[-1] if one_scene else key: each["share"] for key, each in saved.items()
         },
         "saved": saved,
-        "scaling": scaling(results, rasterizer.name),
-        "machine": machine,
+        "scaling": timing.scaling(results, rasterizer.name),
+        "machine": timing.describe_machine(device) | loads,
     }
     return Report(data, _table(data))
 
@@ -91,7 +76,7 @@ def _generated(gaussians: tuple[int, ...], sizes: list[Size], device: torch.devi
     for count in gaussians:
         for size in sizes:
             splats, view = make_scene(count).to(device).splats(), make_view(*size).to(device)
-            cut = torch.full_like(splats.opacities, TRUNCATION)
+            cut = torch.full_like(splats.opacities, timing.TRUNCATION)
             scenes.append((f"bench-{count}", splats, view, cut, {}))
     return scenes
 
@@ -114,8 +99,9 @@ def _of_model(
     for width, height in sizes:
         view = replace(first, width=width, height=height)
         cut = thresholds_for(RasterInputs(view, splats), loaded.thresholds)
-        cut = torch.full_like(splats.opacities, TRUNCATION) if cut is None else cut.detach()
-        scenes.append((model.stem, splats, view, cut, loaded.rules))
+        if cut is None:
+            cut = torch.full_like(splats.opacities, timing.TRUNCATION)
+        scenes.append((model.stem, splats, view, cut.detach(), loaded.rules))
     return scenes
 
 

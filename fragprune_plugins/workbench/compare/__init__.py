@@ -6,30 +6,20 @@ from typing import Any
 
 import click
 
+from fragprune_plugins.workbench.commands import options as shared
 from fragprune_plugins.workbench.commands.command import Command, Report, work_of
-from fragprune_plugins.workbench.commands.options import (
-    CAMERAS_APART,
-    DATA_HELP,
-    FILE,
-    MODEL,
-    engine_options,
-    own_picture_options,
-    scene_options,
-    truncation_option,
-    views_option,
-)
 
 
-@click.command("compare", cls=Command, rules=[CAMERAS_APART])
-@click.argument("a", type=MODEL)
-@click.argument("b", type=MODEL)
-@scene_options(
-    f"{DATA_HELP} Default: that of the training, run or fine-tuning that wrote the models."
+@click.command("compare", cls=Command, rules=[shared.CAMERAS_APART])
+@click.argument("a", type=shared.MODEL)
+@click.argument("b", type=shared.MODEL)
+@shared.scene_options(
+    f"{shared.DATA_HELP} Default: that of the training, run or fine-tuning that wrote the models."
 )
-@own_picture_options
-@click.option("--out", type=FILE, help="Folder for side-by-side pictures.")
-@views_option
-@truncation_option
+@shared.own_picture_options
+@click.option("--out", type=shared.FILE, help="Folder for side-by-side pictures.")
+@shared.views_option
+@shared.truncation_option
 @click.option(
     "--enlarge",
     type=click.IntRange(1, 16),
@@ -38,7 +28,7 @@ from fragprune_plugins.workbench.commands.options import (
     help="Time frames this many times as wide and high as the photographs. All other figures are "
     "still those at the photographs' size.",
 )
-@engine_options()
+@shared.engine_options()
 def command(**options: Any) -> Report:
     """Measure A and B on the same photographs, or against A's own pictures.
 

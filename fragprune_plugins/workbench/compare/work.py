@@ -18,15 +18,10 @@ from fragprune_plugins.workbench.commands.opening import (
     own_cameras,
 )
 from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
+from fragprune_plugins.workbench.figures import wording
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
 from fragprune_plugins.workbench.figures.pictures import leave_panels
 from fragprune_plugins.workbench.figures.recorded import Recorded, recorded
-from fragprune_plugins.workbench.figures.wording import (
-    describe,
-    gain,
-    nothing_drawn,
-    strangers,
-)
 from fragprune_plugins.workbench.models.model import load, writable_folder
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
 from fragprune_plugins.workbench.scenes.output import trained_on
@@ -54,19 +49,17 @@ def compare(
     if own is None and scene.data is None:
         own = _recorded_cameras(scene, a, b)
     photographs = None if own else _photographs(scene, known, a, b)
-    models, candidates = [], []
+    candidates = []
     for path in (a, b):
         how = known.get(path)
         filtered, drawing = (how.filtered, how.drawing) if how else (False, {})
         model = load(path, truncation=not no_truncation, filtered=filtered, device=device)
-        models.append(model)
         candidates.append(Candidate(model, drawing))
-    if photographs is not None:
-        dataset, shown = load_photographs(photographs).to(device), f"{photographs.folder}"
+    if own is not None:
+        dataset, shown = own.pictures(candidates[0].model, rasterizer), "A's own"
     else:
-        assert own is not None
-        dataset = own.pictures(models[0], rasterizer)
-        shown = "A's own"
+        assert photographs is not None
+        dataset, shown = load_photographs(photographs).to(device), f"{photographs.folder}"
     shots = chosen(dataset, views)
     before, after = measure_all(candidates, shots, engine=rasterizer, enlarge=enlarge)
     measured = [(str(a), before), (str(b), after)]
@@ -95,7 +88,7 @@ def _figures(
         "device": before["device"],
         "enlarge": enlarge,
         "scene": photographs.as_dict() if photographs else None,
-        "warnings": nothing_drawn(drawn) + strangers(before, after),
+        "warnings": wording.nothing_drawn(drawn) + wording.strangers(before, after),
     }
 
 
@@ -108,9 +101,9 @@ def _lines(
     pictures = "Photographs" if report["scene"] else "Pictures"
     return [
         f"A: {a}\nB: {b}\n{pictures}: {shown}, {width}x{height} pixels\n",
-        describe({"A": before, "B": after}),
+        wording.describe({"A": before, "B": after}),
         *([f"Frames of {enlarge * width}x{enlarge * height} pixels."] if enlarge > 1 else []),
-        f"\nB against A: {gain(before, after)}.",
+        f"\nB against A: {wording.gain(before, after)}.",
         *(f"Warning: {each}" for each in report["warnings"]),
     ]
 
@@ -120,8 +113,7 @@ def _records(*models: Path) -> dict[Path, Recorded]:
     known: dict[Path, Recorded] = {}
     for model in models:
         record = records.beside(model)
-        read = recorded(record) if record else None
-        if read:
+        if record and (read := recorded(record)):
             known[model] = read
             known |= {other: read for other in models if other.resolve() == read.models[0]}
     return known

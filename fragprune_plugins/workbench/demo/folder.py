@@ -47,12 +47,9 @@ def clear(out: Path) -> None:
 
 @contextlib.contextmanager
 def claiming(out: Path, *names: str) -> Iterator[None]:
-    """After the block, list files and folders with these names in the marker.
+    """After the block, list files and folders of these names, which it writes, in the marker.
 
     This happens also if the block fails, so that the next demo can delete them.
-
-    Args:
-        names: names in ``out`` that the block writes.
     """
     try:
         yield

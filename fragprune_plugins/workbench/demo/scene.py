@@ -23,12 +23,8 @@ def make_scene(
     """Copy the photographs, their cameras and points to ``images/`` and ``sparse/0/`` of a folder.
 
     Args:
-        views: how many photographs, of 48.
-        width: width of the photographs in pixels, of 320; the height is three quarters of it.
-        points: how many points, of 4000.
-
-    Raises:
-        OutputError: the folder cannot be written.
+        views, points: how many, of 48 and 4000.
+        width: of the photographs in pixels, of 320; the height is three quarters of it.
     """
     images, sparse = writable_folder(folder / "images"), writable_folder(folder / "sparse" / "0")
     for photograph in sorted((ROOM / "images").iterdir())[:views]:

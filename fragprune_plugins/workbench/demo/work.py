@@ -7,7 +7,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,6 @@ import click
 
 from fragprune_plugins.files import records
 from fragprune_plugins.files.atomic import replacing
-from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.injection.launch import RunOptions, RunSummary, run
 from fragprune_plugins.learning.goals import Control
@@ -64,9 +63,7 @@ class DemoSettings:
     """Settings of a demo.
 
     Attributes:
-        iterations: number of iterations of the host's own training.
-        finetune: number of iterations of stage 2.
-        device: "cpu" or a CUDA device.
+        iterations, finetune: of the host's own training, and of stage 2.
         views, width, points: of the scene, as ``make_scene`` takes them.
     """
 
@@ -124,9 +121,7 @@ def host_command(scene: Path, model: Path, settings: DemoSettings) -> list[str]:
 
 
 def run_demo(
-    out: Path,
-    settings: DemoSettings | None = None,
-    say: Callable[[str], None] = lambda line: None,
+    out: Path, settings: DemoSettings, say: Callable[[str], None] = lambda line: None
 ) -> dict[str, Any]:
     """Train the host on the room, fine-tune, measure and draw. Progress goes to stderr.
 
@@ -141,8 +136,6 @@ def run_demo(
     Raises:
         OutputError: the folder cannot be written, or holds files that no demo wrote.
     """
-
-    settings = settings or DemoSettings()
     clear(out)
     seconds: dict[str, float] = {}
     scene, model = out / "scene", out / "model"
@@ -161,44 +154,37 @@ def run_demo(
         learning = Settings(iterations=settings.finetune, seed=settings.seed)
         options = RunOptions(settings=learning, engine=settings.engine, device=settings.device)
         summary = run(command, options)
+    assert summary.model_before is not None  # the host saves at its last iteration
+    assert summary.model_after is not None
+    pair = summary.model_before, summary.model_after
+    before, after = (models.load(path, device=settings.device) for path in pair)
     with _timed(seconds, "control"):
         say(f"2/4  The control: the same {settings.finetune} iterations without cutoffs")
-        control = _control(scene, summary, settings)
+        learning = replace(learning, goal=Control())
+        given = before, load_dataset(scene), learning
+        control = finetune(*given, engine=settings.engine, progress=True).model
     with _timed(seconds, "measure"):
         say("3/4  Measuring on the held-out views")
-        report = _measure(scene, summary, control, settings)
+        candidates = [Candidate(each) for each in (before, after, control)]
+        report = _measure(scene, candidates, settings, summary)
     with _timed(seconds, "pictures"), claiming(out, "pictures", "index.html", "model"):
         say("4/4  Drawing the pictures")
         report["files"] = write_page(
             out, report, scene, summary.curves, settings.engine, settings.device
         )
-        _record(report, scene, summary)
+        read = Recorded(Photographs(scene), pair, filtered=True, drawing=summary.drawing)
+        more = {"curves": summary.curves, "photographs": read.as_dict()}
+        records.leave(summary.model_after, "run", report | more)  # as of run, for report
     report |= {"seconds_by_part": seconds, "seconds": sum(seconds.values())}
     with claiming(out, REPORT), replacing(out / REPORT) as path:
         path.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     return report
 
 
-def _control(scene: Path, summary: RunSummary, settings: DemoSettings) -> Model:
-    assert summary.model_before is not None  # the host saves at its last iteration
-    model = models.load(summary.model_before, device=settings.device)
-    learning = Settings(iterations=settings.finetune, goal=Control(), seed=settings.seed)
-    data = load_dataset(scene)
-    return finetune(model, data, learning, engine=settings.engine, progress=True).model
-
-
 def _measure(
-    scene: Path, summary: RunSummary, control: Model, settings: DemoSettings
+    scene: Path, candidates: list[Candidate], settings: DemoSettings, summary: RunSummary
 ) -> dict[str, Any]:
-    assert summary.model_before is not None
-    assert summary.model_after is not None
-    candidates = [
-        *(
-            Candidate(models.load(path, device=settings.device))
-            for path in (summary.model_before, summary.model_after)
-        ),
-        Candidate(control),
-    ]
+    """Figures of the original, the pruned model and the control, on held-out views."""
     shots = load_dataset(scene).test
     before, after, zero = measure_all(candidates, shots, engine=settings.engine, repeats=_REPEATS)
     return {
@@ -211,27 +197,16 @@ def _measure(
         "control_psnr_change": zero["psnr"] - before["psnr"],
         "ssim_change": after["ssim"] - before["ssim"],
         "gaussians": after["gaussians"],
+        "engine": after["engine"],
+        "device": after["device"],
         "iterations": summary.steps,
         "train_seconds": summary.train_seconds,
         "adapter": summary.adapter,
-        "engine": after["engine"],
-        "device": after["device"],
         "seed": settings.seed,
         "model_before": str(summary.model_before),
         "model_after": str(summary.model_after),
         "settings": summary.settings,
     }
-
-
-def _record(report: dict[str, Any], scene: Path, summary: RunSummary) -> None:
-    """Leave what ``fragprune run`` leaves beside its model, for ``fragprune report``."""
-
-    assert summary.model_before is not None
-    assert summary.model_after is not None
-    models = summary.model_before, summary.model_after
-    read = Recorded(Photographs(scene), models, filtered=True, drawing=summary.drawing)
-    more = {"curves": summary.curves, "photographs": read.as_dict()}
-    records.leave(summary.model_after, "run", report | more)
 
 
 @contextlib.contextmanager
@@ -254,7 +229,6 @@ def write_page(
 
     Args:
         report: the measurements; "larger" is added, frame times of pictures as large as the page's.
-        curves: the run's learning curves, one dict per step.
 
     Returns:
         The files as paths relative to ``out``.

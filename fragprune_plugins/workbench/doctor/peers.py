@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from typing import Any
 
@@ -17,6 +16,7 @@ from torch import Tensor
 
 from fragprune_plugins.errors import EngineError
 from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats
+from fragprune_plugins.workbench.doctor.work import package_version
 
 
 class Peer:
@@ -55,14 +55,9 @@ class Peer:
 
 def installed() -> dict[str, str]:
     """The packages of peers that are here, with their versions."""
-    return {name: _version(name) for name in PEERS if find_spec(name) is not None}
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "unknown"
+    return {
+        name: package_version(name) or "unknown" for name in PEERS if find_spec(name) is not None
+    }
 
 
 def peer(name: str) -> Peer:
@@ -112,10 +107,8 @@ def _hosts(inputs: RasterInputs, splats: Splats) -> tuple[Tensor, Tensor]:
 def _gsplat(inputs: RasterInputs, splats: Splats) -> tuple[Tensor, Tensor]:
     """gsplat's ``rasterization`` in its classic mode, with the hosts' near plane."""
     view = inputs.view
-    focal_x = view.width / (2 * view.tan_fov_x)
-    focal_y = view.height / (2 * view.tan_fov_y)
-    centre = view.width / 2, view.height / 2
-    lens = [[focal_x, 0.0, centre[0]], [0.0, focal_y, centre[1]], [0.0, 0.0, 1.0]]
+    x, y = view.width / 2, view.height / 2
+    lens = [[x / view.tan_fov_x, 0.0, x], [0.0, y / view.tan_fov_y, y], [0.0, 0.0, 1.0]]
     images, _, meta = import_module("gsplat").rasterization(
         means=splats.means,
         quats=splats.rotations,

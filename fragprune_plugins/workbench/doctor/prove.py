@@ -33,14 +33,8 @@ from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import FragpruneError
 from fragprune_plugins.slicing.cutting import expect_right
 from fragprune_plugins.types import RasterInputs, Splats, one_line
+from fragprune_plugins.workbench.bench import timing
 from fragprune_plugins.workbench.bench.scene import make_scene, make_view
-from fragprune_plugins.workbench.bench.timing import (
-    Case,
-    Pass,
-    describe_machine,
-    load_average,
-    measure,
-)
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.doctor import peers
 from fragprune_plugins.workbench.doctor.emulated import (
@@ -59,7 +53,6 @@ SCENES = {
 """Gaussians and size of the timed pictures, by the kind of device."""
 
 _NOT_EMULATED = "no C++17 compiler on Linux: install g++, or name one with CXX, and prove again"
-_KINDS: tuple[Pass, ...] = ("forward", "forward_backward")
 _CLOCKS = ("driver_version", "clocks.sm", "clocks.max.sm", "clocks.mem", "temperature.gpu")
 
 
@@ -105,7 +98,7 @@ def prove(say: Callable[[str], None] | None = None, repeats: int = 9) -> Report:
         "format": FORMAT,
         "fragprune": VERSION,
         "when": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
-        "machine": describe_machine(kind) | {"load_before": load_average()},
+        "machine": timing.describe_machine(kind) | {"load_before": timing.load_average()},
         "clocks": _clocks() if kind == "cuda" else None,
         "peers": peers.installed(),
         "hashes": _hashes(),
@@ -114,7 +107,7 @@ def prove(say: Callable[[str], None] | None = None, repeats: int = 9) -> Report:
         "emulation": emulation,
         "times": list(_times(passed, kind, repeats, say)),
     }
-    data["machine"]["load_after"] = load_average()
+    data["machine"]["load_after"] = timing.load_average()
     return Report(data, _text(data), exit_code=0 if _proved(data) else 1)
 
 
@@ -134,9 +127,6 @@ def _ours(kind: str) -> Iterator[Contestant]:
         yield Contestant("cuda", CudaEngine())
 
 
-# ---- correctness ---------------------------------------------------------------------------------
-
-
 def _check(contestant: Contestant, kind: str) -> dict[str, Any]:
     """Every difference from the oracle in float64; empty if there is none."""
     where = "cpu" if isinstance(contestant.engine, CpuEngine) else kind
@@ -144,11 +134,10 @@ def _check(contestant: Contestant, kind: str) -> dict[str, Any]:
     if not contestant.ours:
         return found | {"differences": list(peer_differences(contestant.engine, where))}
     rows = [held(contestant.engine, where, scene) for scene in scenes()]
-    return found | {"differences": _differences(rows), "scenes": rows}
-
-
-def _differences(rows: Sequence[dict[str, Any]]) -> list[str]:
-    return [each for row in rows for each in row["differences"]]
+    return found | {
+        "differences": [each for row in rows for each in row["differences"]],
+        "scenes": rows,
+    }
 
 
 def _emulation(say: Callable[[str], None]) -> dict[str, Any]:
@@ -164,21 +153,14 @@ def _emulation(say: Callable[[str], None]) -> dict[str, Any]:
         for scene in scenes():
             say(f"emulating the cuda kernels: {scene.name}")
             rows.append(held(engine, "cpu", scene))
-        differences = _differences(rows)
+        differences = [each for row in rows for each in row["differences"]]
         say("emulating the cuda kernels: a cut in time")
         try:
             expect_right(device, torch.device("cpu"))
         except (FragpruneError, RuntimeError) as error:
             differences.append(f"a cut in time: {str(error).splitlines()[0]}")
-    return {
-        "compiler": version_of(compiler),
-        "not_proved": None,
-        "differences": differences,
-        "scenes": rows,
-    }
-
-
-# ---- time ----------------------------------------------------------------------------------------
+    proved = {"compiler": version_of(compiler), "not_proved": None}
+    return proved | {"differences": differences, "scenes": rows}
 
 
 def _times(
@@ -189,10 +171,10 @@ def _times(
     ours = [each for each in timed if each.ours]
     for count, size in SCENES[kind]:
         splats, view = make_scene(count).to(kind).splats(), make_view(*size).to(kind)
-        cut = torch.full_like(splats.opacities, TRUNCATION)
+        cut = torch.full_like(splats.opacities, timing.TRUNCATION)
         cases = [
-            Case(f"bench-{count}", view, splats, way, thresholds)
-            for way in _KINDS
+            timing.Case(f"bench-{count}", view, splats, way, thresholds)
+            for way in timing.PASSES
             for thresholds in (None, cut)
         ]
         plain = [case for case in cases if case.thresholds is None]
@@ -202,7 +184,7 @@ def _times(
             if not engines:
                 continue
             say(f"timing {what}: {count:,} Gaussians at {size[0]}x{size[1]}")
-            rows = measure(some, [each.engine for each in engines], repeats=repeats)
+            rows = timing.measure(some, [each.engine for each in engines], repeats=repeats)
             names = [each.name for _ in some for each in engines]
             for name, row in zip(names, rows, strict=True):
                 yield {"round": what} | _finite(row) | {"engine": name}
@@ -214,9 +196,6 @@ def _finite(row: dict[str, Any]) -> dict[str, Any]:
         key: None if isinstance(each, float) and math.isnan(each) else each
         for key, each in row.items()
     }
-
-
-# ---- what is printed -----------------------------------------------------------------------------
 
 
 def _hashes() -> dict[str, str]:
@@ -292,9 +271,6 @@ def _table(rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-TRUNCATION = 16 / 255
-"""One threshold for all Gaussians of the timed scene."""
-
 MISCOUNTED = 1 / 500
 """The share of pixels whose fragments may be counted otherwise.
 
@@ -338,7 +314,7 @@ def scenes() -> tuple[Scene, ...]:
         Scene("cutoffs", inputs, thresholds),
         Scene("no cutoffs", inputs, None),
         Scene("a stop", replace(inputs, stop=0.05), thresholds),
-        Scene("the timed scene, small", timed, torch.full((6000,), TRUNCATION)),
+        Scene("the timed scene, small", timed, torch.full((6000,), timing.TRUNCATION)),
     )
 
 

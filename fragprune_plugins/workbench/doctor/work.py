@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import platform
 import re
-from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, Final
 
@@ -24,7 +23,7 @@ _AGREES = {"agrees": True, "fails": False, "could not run": None}
 
 def examine() -> Report:
     """What is installed, and what is wrong with it."""
-    packages = {name: _version(name) for name in _PACKAGES}
+    packages = {name: package_version(name) for name in _PACKAGES}
     native = _cpu_engine()
     # This comes first, because a GPU may allow only one process.
     verdict = self_check.check_in_subprocess("cuda") if driver.missing() is None else None
@@ -48,11 +47,14 @@ def examine() -> Report:
         "adapters": [adapter.name for adapter in plugins.adapters],
         "findings": [finding.as_dict() for finding in plugins.findings],
     }
+    of_cpu = f"its {native['build']} build, {native['path']}"
+    if not native["available"]:
+        of_cpu = f"missing, {native['reason']}"
     lines = [
         f"python {data['python']} on {data['platform']}",
         ", ".join(f"{name} {found or 'missing'}" for name, found in packages.items()),
         f"CUDA {'yes' if data['cuda'] else 'no'}; {data['threads']} threads",
-        _of_cpu(native),
+        f"cpu engine: {of_cpu}",
         _of_cuda(gpu),
         f"engines: {', '.join(data['engines'])}",
         f"adapters: {', '.join(data['adapters']) or 'none'}",
@@ -86,7 +88,7 @@ def build(architectures: str) -> Report:
             for source, macros in VARIANTS:
                 image, had = kernels.image_of(source, {**MACROS, **macros}, target, compiler)
                 for name, needs in resources(image.log).items():
-                    built.append({"target": target, "kernel": name, "kept": had, **vars(needs)})
+                    built.append({"target": target, "kernel": name, "kept": had, **needs})
     except kernels.Unavailable as why:
         raise EngineError(
             "--build-cuda",
@@ -105,12 +107,6 @@ def build(architectures: str) -> Report:
     return Report(data, "\n".join(lines))
 
 
-def _of_cpu(native: dict[str, Any]) -> str:
-    if not native["available"]:
-        return f"cpu engine: missing, {native['reason']}"
-    return f"cpu engine: its {native['build']} build, {native['path']}"
-
-
 def _of_cuda(gpu: dict[str, Any]) -> str:
     if not gpu["available"]:
         return f"cuda engine: none, {gpu['reason']}. For an NVIDIA GPU: {driver.remedy()}"
@@ -120,7 +116,8 @@ def _of_cuda(gpu: dict[str, Any]) -> str:
     )
 
 
-def _version(package: str) -> str | None:
+def package_version(package: str) -> str | None:
+    """The version of a package; None if it is not installed."""
     try:
         return version(package)
     except PackageNotFoundError:
@@ -176,35 +173,22 @@ VARIANTS: Final[tuple[tuple[str, dict[str, int]], ...]] = (
 """Sources with macros that training and fine-tuning usually ask for, to be built beforehand."""
 
 
-@dataclass(frozen=True)
-class Resources:
-    """The resources of a multiprocessor that a kernel needs.
+def resources(log: str) -> dict[str, dict[str, int]]:
+    """The resources of each kernel, from the report of ptxas -v.
 
-    Attributes:
-        registers: per thread.
-        stack: bytes of local memory per thread, for arrays that did not fit into registers.
-        spills: bytes stored to local memory and loaded again.
-        shared: bytes of shared memory per block.
+    registers, of a thread; stack, its bytes of local memory for what did not fit into them; spills,
+    bytes stored there and loaded again; shared, bytes of shared memory of a block.
     """
-
-    registers: int
-    stack: int
-    spills: int
-    shared: int
-
-
-def resources(log: str) -> dict[str, Resources]:
-    """The resources of each kernel, from the report of ptxas -v."""
     found = {}
     for part in re.split(r"Compiling entry function '", log)[1:]:
         name = part.split("'", 1)[0]
         stack, stores, loads = re.findall(r"(\d+) bytes (?:stack|spill)", part)[:3]
         registers = re.search(r"Used (\d+) registers", part)
         shared = re.search(r"(\d+) bytes smem", part)
-        found[name] = Resources(
-            registers=int(registers.group(1)) if registers else 0,
-            stack=int(stack),
-            spills=int(stores) + int(loads),
-            shared=int(shared.group(1)) if shared else 0,
-        )
+        found[name] = {
+            "registers": int(registers[1]) if registers else 0,
+            "stack": int(stack),
+            "spills": int(stores) + int(loads),
+            "shared": int(shared[1]) if shared else 0,
+        }
     return found

@@ -52,23 +52,20 @@ def export(
     held += f" in the column {column}" if column else ""
     held += "" if splat.rim == "hard" else f" and a {splat.rim} rim"
     held += "" if splat.stop is None else f" and a stop at {splat.stop:g}"
-    lines.append(
-        describe_written(out, f": {len(splat)} Gaussians with {held}", pruned=splat.pruned)
-    )
-    return Report(
-        {
-            "model": str(model),
-            "out": str(out),
-            "format": form.name,
-            "keeps": form.keeps or None,
-            "gaussians": len(splat),
-            "thresholds": truncated,
-            **splat.rules,
-            "column": column,
-            "dropped": dropped,
-        },
-        "\n".join(lines),
-    )
+    held = f": {len(splat)} Gaussians with {held}"
+    lines.append(describe_written(out, held, pruned=splat.pruned))
+    data = {
+        "model": str(model),
+        "out": str(out),
+        "format": form.name,
+        "keeps": form.keeps or None,
+        "gaussians": len(splat),
+        "thresholds": truncated,
+        **splat.rules,
+        "column": column,
+        "dropped": dropped,
+    }
+    return Report(data, "\n".join(lines))
 
 
 def _restored(edited: Model, path: Path, source: Path) -> Model:

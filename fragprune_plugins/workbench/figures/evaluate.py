@@ -119,21 +119,15 @@ def measure_all(
     repeats: int = REPEATS,
     enlarge: int = 1,
 ) -> list[dict[str, Any]]:
-    """Measure models against the same pictures, as ``measure`` does.
+    """Measure models, all on one device, against the same pictures: the figures of ``measure``.
 
     Frames of all are timed in turns, so that a busy machine slows them alike.
 
     Args:
-        candidates: the splats to measure, all on one device; views move there.
-        shots: the views. Figures are means over them.
         enlarge: timed frames are this many times as wide and high as the pictures.
-
-    Returns:
-        The figures of each, as those of ``measure``.
     """
     device = candidates[0].model.device
-    if isinstance(engine, str):
-        engine = engine_for(engine, device)
+    engine = engine_for(engine, device)
     shots = [shot.to(device) for shot in shots]
     reports: list[dict[str, Any]] = []
     for candidate in candidates:
@@ -211,14 +205,7 @@ def frame_times(
     *,
     repeats: int = REPEATS,
 ) -> list[dict[str, float]]:
-    """Time frames of splats in turns, as ``measure`` does.
-
-    Args:
-        repeats: number of timed frames for each view and candidate.
-
-    Returns:
-        One dict a candidate: frame_ms and frame_ms_se, as those of ``measure``.
-    """
+    """Time frames of splats in turns: frame_ms and frame_ms_se of each, as those of ``measure``."""
     turns = rounds(candidates, views, engine)
     times = [next(turns) for _ in bar(range(repeats), "timing frames")]
     return [

@@ -104,16 +104,21 @@ def covered(engine: Engine, inputs: RasterInputs, squared: Tensor) -> RasterOutp
     return engine.rasterize(inputs, (-squared / 2).exp().clamp(max=1.0))
 
 
+def quads(engine: Engine, inputs: RasterInputs, squared: Tensor) -> float:
+    """Pixels of quads around such ellipses: 4 / pi times theirs, over those of the picture."""
+    return 4 / math.pi * float(covered(engine, inputs, squared).fragments_per_pixel)
+
+
 def shaded(engine: Engine, inputs: RasterInputs, viewer: Viewer) -> float:
     """Pixels that a viewer is asked to shade, over the pixels of the picture.
 
-    Quads have 4 / pi times the area of their ellipses, whose pixels are counted. For tiles it is
-    the pixels of all (Gaussian, tile) pairs, those too that are spared where a tile is opaque.
+    For tiles it is the pixels of all (Gaussian, tile) pairs, those too that are spared where a tile
+    is opaque.
     """
     assert isinstance(inputs.splats, Splats)
     squared = viewer.extent.squared(inputs.splats.opacities)
     if viewer.shape == "quad":
-        return 4 / math.pi * float(covered(engine, inputs, squared).fragments_per_pixel)
+        return quads(engine, inputs, squared)
     (xx, xy, yy), means2d, visible = project(inputs, inputs.splats)
     if viewer.shape == "square":
         middle = (xx + yy) / 2

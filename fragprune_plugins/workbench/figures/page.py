@@ -40,11 +40,6 @@ class Table:
     caption: str = ""
     words: int = 1
 
-    def __post_init__(self) -> None:
-        for row in self.rows:
-            if len(row) != len(self.head):
-                raise ValueError(f"a row of {len(row)} cells under {len(self.head)} names")
-
 
 def render(template: Path, *others: Path, **values: Any) -> str:
     """A page.

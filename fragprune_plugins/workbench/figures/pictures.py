@@ -26,16 +26,9 @@ from fragprune_plugins.workbench.scenes.dataset import Shot
 COLOURS = "inferno"
 LABEL = "drawn fragments per pixel"
 
-BESIDE = tuple(
-    f"_{kind}"
-    for kind in (
-        *("fragments", "panel", "photograph", "original", "pruned", "overdraw"),
-        *(
-            f"{model}_{shown}"
-            for model in ("original", "pruned")
-            for shown in ("fragments", "error")
-        ),
-    )
+BESIDE = (
+    *("_fragments", "_panel", "_photograph", "_original", "_pruned", "_overdraw"),
+    *("_original_fragments", "_original_error", "_pruned_fragments", "_pruned_error"),
 )
 """What commands add to a view's name for further pictures of it."""
 
@@ -76,7 +69,8 @@ def save_image(path: Path, image: Tensor) -> None:
 
 def picture(image: Tensor) -> PIL.Image.Image:
     """An image (3, H, W), clamped to [0, 1], with 8 bits a channel."""
-    return PIL.Image.fromarray(_bytes(image))
+    values = 255 * image.detach().clamp(0, 1).permute(1, 2, 0).cpu().numpy()
+    return PIL.Image.fromarray(np.round(values).astype(np.uint8))
 
 
 def save_map(path: Path, values: Tensor, limit: float) -> None:
@@ -86,7 +80,6 @@ def save_map(path: Path, values: Tensor, limit: float) -> None:
         values: 0 or more.
         limit: the value at the top of the scale; what is larger looks like it.
     """
-
     with replacing(path) as temporary:
         _map(values, limit).save(temporary, format="PNG")
 
@@ -100,7 +93,6 @@ def _map(values: Tensor, limit: float) -> PIL.Image.Image:
 
 def colour_stops(count: int = 9) -> list[str]:
     """Colours of maps from 0 to their limit, evenly spaced, as ``#rrggbb``."""
-
     return [to_hex(colormaps[COLOURS](at / (count - 1))) for at in range(count)]
 
 
@@ -132,11 +124,6 @@ def save_panel(path: Path, pictures: Sequence[tuple[str, Tensor]], limit: float)
         panel.save(temporary, format="PNG")
 
 
-def _bytes(image: Tensor) -> np.ndarray[Any, Any]:
-    values: np.ndarray[Any, Any] = image.detach().clamp(0, 1).permute(1, 2, 0).cpu().numpy()
-    return np.round(255 * values).astype(np.uint8)
-
-
 PANELS = 4
 
 
@@ -161,36 +148,18 @@ def leave_panels(
 def draw_panels(
     out: Path, columns: dict[str, Candidate], shots: Sequence[Shot], engine: Engine
 ) -> list[Path]:
-    """Draw evenly spread views: photograph, renders, and fragment densities on one scale.
-
-    Args:
-        shots: the views; ``PANELS`` of them at most are drawn.
-
-    Returns:
-        The files, one for each drawn view.
-    """
+    """Draw ``PANELS`` evenly spread views at most: photograph, renders, fragments on one scale."""
     files = []
     chosen = evenly(shots, PANELS)
     for stem, shot in zip(stems([shot.name for shot in chosen]), chosen, strict=True):
-        with torch.no_grad():
-            outputs = {
-                name: candidate.draw(engine, shot.view, counts=True)
-                for name, candidate in columns.items()
-            }
-        heat = {
-            name: output.fragments
-            for name, output in outputs.items()
-            if output.fragments is not None
-        }
-        file = out / f"{stem}_panel.png"
-        save_panel(
-            file,
-            [
-                (shot.target, shot.image),
-                *((name, output.image) for name, output in outputs.items()),
-                *((f"{name}: {float(c.float().mean()):.1f}/px", c) for name, c in heat.items()),
-            ],
-            max(float(fragments.max()) for fragments in heat.values()),
-        )
-        files.append(file)
+        shown, heat = [(shot.target, shot.image)], []
+        for name, candidate in columns.items():
+            with torch.no_grad():
+                output = candidate.draw(engine, shot.view, counts=True)
+            assert output.fragments is not None
+            shown.append((name, output.image))
+            mean = float(output.fragments.float().mean())
+            heat.append((f"{name}: {mean:.1f}/px", output.fragments))
+        files.append(out / f"{stem}_panel.png")
+        save_panel(files[-1], shown + heat, max(float(each.max()) for _, each in heat))
     return files

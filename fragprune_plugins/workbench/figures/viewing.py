@@ -136,9 +136,7 @@ def rasterize(
         inputs = replace(inputs, stop=stop, rim=rim)
     thresholds = thresholds_for(inputs, thresholds)
     inputs.check_thresholds(thresholds)  # also for engines that are not ours
-    if isinstance(engine, str):
-        engine = engine_for(engine, inputs.splats.device)
-    return engine.rasterize(inputs, thresholds)
+    return engine_for(engine, inputs.splats.device).rasterize(inputs, thresholds)
 
 
 def _of_model(model: Any, view: Any) -> tuple[RasterInputs, ThresholdStore | None]:

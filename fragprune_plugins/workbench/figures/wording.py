@@ -78,10 +78,7 @@ def measured_with(columns: Mapping[str, dict[str, Any]]) -> str:
 
 
 def tabulate(columns: Mapping[str, dict[str, Any]]) -> list[list[str]]:
-    """Rows of a table, the first one its head: a figure, each measurement's, and the change.
-
-    The change is that between the last two measurements; one alone has none.
-    """
+    """Rows of a table, its head first: a figure, each measurement's, and the last two's change."""
     reports = list(columns.values())
     change = ["change"] if len(reports) > 1 else []
     rows = [["", *columns, *change]]
@@ -143,7 +140,7 @@ def outcome(command: str, data: dict[str, Any], control: dict[str, Any] | None) 
     Args:
         command: "run" or "finetune".
         data: its figures, including "before", "after" and "settings".
-        control: the measurement after as many iterations without truncation; None if not run.
+        control: what as many iterations without truncation gave; None if not run.
     """
     before, after = data["before"], data["after"]
     gained = f"{gain(before, after)} that were held out"
@@ -166,6 +163,14 @@ def outcome(command: str, data: dict[str, Any], control: dict[str, Any] | None) 
     return said + missed(data) + _fell(before, after, control)
 
 
+def outcome_in_training(data: Mapping[str, Any]) -> str:
+    """A sentence for the gain of a run on training views, where no others were measured."""
+    seen = data["training_views"]
+    change = fewer(seen["fragments_per_pixel_before"], seen["fragments_per_pixel_after"])
+    end = IS_CONTROL if data["settings"]["goal"] == CONTROL else f".{missed(data)}"
+    return f"{change} on training views; frame times were not measured{end}"
+
+
 def headlines(data: Mapping[str, Any], control: dict[str, Any] | None) -> list[tuple[str, str]]:
     """Three figures of a fine-tuning in plain words: fragments, frame time, picture.
 
@@ -181,8 +186,8 @@ def headlines(data: Mapping[str, Any], control: dict[str, Any] | None) -> list[t
     of = f" of {larger['size']}" if "size" in larger else ""
     was, now = (each["fragments_per_pixel"] for each in (before, after))
     slow, fast = (larger[key]["frame_ms"] for key in ("before", "after"))
-    faster, error = _faster(larger["before"], larger["after"])
-    if abs(faster - 1) > CLAIMED * error:
+    faster, _, claimed = _faster(larger["before"], larger["after"])
+    if claimed:
         frame = f"{faster:.2f}x", f"as fast: frames{of} in {slow:.2f} → {fast:.2f} ms"
     else:  # no ratio: a busy machine tells none
         frame = f"{slow:.1f} → {fast:.1f} ms", f"for frames{of}: no difference beyond the noise"
@@ -246,7 +251,7 @@ def begun(data: dict[str, Any], removed: int, views: int = 0) -> list[str]:
     return lines
 
 
-def missed(data: dict[str, Any]) -> str:
+def missed(data: Mapping[str, Any]) -> str:
     """That a fine-tuning missed its target, a sentence with a space before it; else nothing."""
     if data.get("target_reached") is not False:
         return ""
@@ -289,8 +294,8 @@ def strangers(a: dict[str, Any], b: dict[str, Any]) -> list[str]:
         return []
     return [
         f"{names[0]} hardly shows these photographs ({worse:.1f} dB, {names[1]} {better:.1f} dB): "
-        f"it may be a model of something else, or in another world frame, and the comparison of "
-        f"speed means little"
+        "it may be a model of something else, or in another world frame, and the comparison of "
+        "speed means little"
     ]
 
 
@@ -310,23 +315,20 @@ def _less(before: float, after: float, word: str = "fewer") -> str:
 
 def _fast(before: dict[str, Any], after: dict[str, Any]) -> str:
     """The ratio of two frame times in words, if it exceeds the standard errors."""
-    ratio, error = _faster(before, after)
-    return f"{ratio:.2f}x as fast" if abs(ratio - 1) > CLAIMED * error else "within noise"
+    ratio, _, claimed = _faster(before, after)
+    return f"{ratio:.2f}x as fast" if claimed else "within noise"
 
 
 def frames(before: dict[str, Any], after: dict[str, Any]) -> str:
     """A phrase for frame times, with their ratio only if it exceeds the standard errors."""
-    ratio, error = _faster(before, after)
-    faster = (
-        f"{ratio:.2f} ± {error:.2f}x as fast"
-        if abs(ratio - 1) > CLAIMED * error
-        else "no difference beyond the noise"
-    )
+    ratio, error, claimed = _faster(before, after)
+    faster = f"{ratio:.2f} ± {error:.2f}x as fast" if claimed else "no difference beyond the noise"
     return f"frames {before['frame_ms']:.2f} -> {after['frame_ms']:.2f} ms ({faster})"
 
 
-def _faster(before: dict[str, Any], after: dict[str, Any]) -> tuple[float, float]:
-    """How many times as fast frames are, and its standard error."""
+def _faster(before: dict[str, Any], after: dict[str, Any]) -> tuple[float, float, bool]:
+    """How many times as fast frames are, its standard error, and whether that is a difference."""
     ratio = before["frame_ms"] / max(after["frame_ms"], 1e-9)
     errors = (report["frame_ms_se"] / max(report["frame_ms"], 1e-9) for report in (before, after))
-    return ratio, ratio * math.hypot(*errors)
+    error = ratio * math.hypot(*errors)
+    return ratio, error, abs(ratio - 1) > CLAIMED * error

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+import contextlib
+from typing import Any
 
 import click
 
+from fragprune_plugins.workbench.commands import options as shared
 from fragprune_plugins.workbench.commands.command import (
     Command,
     Report,
@@ -15,35 +17,19 @@ from fragprune_plugins.workbench.commands.command import (
 from fragprune_plugins.workbench.commands.config import config_option
 from fragprune_plugins.workbench.commands.learning import LEARNING_APART, learning_options
 from fragprune_plugins.workbench.commands.logs import log_option
-from fragprune_plugins.workbench.commands.options import (
-    FILE,
-    MODEL,
-    OutFile,
-    engine_options,
-    scene_options,
-    shard_option,
-)
 from fragprune_plugins.workbench.commands.rules import Alone, Needs, apart
 from fragprune_plugins.workbench.models import formats
 from fragprune_plugins.workbench.ranks import launched
 
 
-def _share(
-    ctx: click.Context, param: click.Parameter, value: str | None
-) -> float | Literal["auto", "visible"] | None:
+def _share(ctx: click.Context, param: click.Parameter, value: str | None) -> float | str | None:
     """A share in (0, 1], or a word."""
-    if value is None:
-        return None
-    words: dict[str, Literal["auto", "visible"]] = {"auto": "auto", "visible": "visible"}
-    if value in words:
-        return words[value]
-    try:
-        share = float(value)
-    except ValueError:
-        share = 0.0
-    if not 0 < share <= 1:
-        raise click.BadParameter(f"{value!r} is not auto, visible or a number with 0 < X <= 1.")
-    return share
+    if value in (None, "auto", "visible"):
+        return value
+    with contextlib.suppress(ValueError):
+        if 0 < float(value) <= 1:
+            return float(value)
+    raise click.BadParameter(f"{value!r} is not auto, visible or a number with 0 < X <= 1.")
 
 
 _PARTS = "options that each process can follow with a part of the Gaussians"
@@ -64,10 +50,10 @@ RULES = (
 
 
 @click.command("finetune", cls=Command, rules=RULES)
-@click.argument("model", type=MODEL)
+@click.argument("model", type=shared.MODEL)
 @click.option(
     "--out",
-    type=OutFile(*formats.ENDINGS),
+    type=shared.OutFile(*formats.ENDINGS),
     required=True,
     help="New model: .ply, .spz, .sog or .glb, which hold its cutoffs. .splat and "
     ".compressed.ply cannot hold any.",
@@ -82,10 +68,10 @@ RULES = (
 )
 @click.option(
     "--cameras",
-    type=FILE,
+    type=shared.FILE,
     help="With --self: cameras.json of a 3DGS model, or transforms_*.json; every 8th is held out.",
 )
-@scene_options()
+@shared.scene_options()
 @learning_options(every_goal=True)
 @log_option
 @config_option
@@ -109,12 +95,12 @@ RULES = (
     "learning rates are the square root of N times higher. More than one serves several "
     "processes under torchrun, which draw them side by side.",
 )
-@shard_option
+@shared.shard_option
 @click.option("--no-truncation", is_flag=True, help="Ignore cutoffs stored with MODEL.")
 @click.option(
     "--again", is_flag=True, help="Begin anew, though OUT is finished or there is a checkpoint."
 )
-@engine_options()
+@shared.engine_options()
 @first_process_prints()
 def command(**options: Any) -> Report | None:
     """Learn how far each Gaussian of MODEL must reach.

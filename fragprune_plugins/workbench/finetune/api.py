@@ -69,7 +69,7 @@ def finetune(
     """
     ranks, model = ranks or Ranks(), models.of(model)
     settings, device = settings or Settings(), model.device
-    engine = engine_for(engine, device) if isinstance(engine, str) else engine
+    engine = engine_for(engine, device)
     dataset = dataset.to(device)
     goal = settings.goal
     if isinstance(goal, AtMost):

@@ -15,17 +15,9 @@ from fragprune_plugins.learning.interruption import EXIT_CODE
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
+from fragprune_plugins.workbench.figures import wording
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
 from fragprune_plugins.workbench.figures.recorded import Recorded
-from fragprune_plugins.workbench.figures.wording import (
-    FELL,
-    ITSELF,
-    begun,
-    columns_of,
-    describe,
-    next_steps,
-    outcome,
-)
 from fragprune_plugins.workbench.finetune.loop import FinetuneResult
 from fragprune_plugins.workbench.finetune.searching import Bounded
 from fragprune_plugins.workbench.finetune.trial import DROPOUT, KEEP, Keep
@@ -120,8 +112,8 @@ class Finetuned:
             scene = photographs.folder
             more["photographs"] = Recorded(photographs, (asked.model, asked.out)).as_dict()
         records.leave(asked.out, "finetune", data | more)
-        text += f"\n{next_steps(asked.out, asked.out.parent, scene)}"  # records name no folders
-        return Report(data, text, exit_code=130 if result.interrupted else 0)
+        then = wording.next_steps(asked.out, asked.out.parent, scene)  # records name no folders
+        return Report(data, f"{text}\n{then}", exit_code=130 if result.interrupted else 0)
 
     def _data(self, figures: Sequence[dict[str, Any]]) -> dict[str, Any]:
         """What the record and ``--json`` say, from figures as ``measured``."""
@@ -164,9 +156,9 @@ class Finetuned:
         result, settings, before = self.result, self.result.settings, data["before"]
         pressure = f" at pressure {data['pressure']:.2g}" if settings.goal.presses else ""
         lines = [
-            describe(columns_of(data)),
+            wording.describe(wording.columns_of(data)),
             "",
-            outcome("finetune", data, data["control"]),
+            wording.outcome("finetune", data, data["control"]),
             f"{result.engine} engine, {data['iterations']} iterations{pressure} in "
             f"{result.train_seconds:.0f} s.",
         ]
@@ -182,7 +174,7 @@ class Finetuned:
         if result.interrupted:
             of = f"{data['iterations']} of {settings.iterations}"
             lines.append(f"Interrupted at {of} iterations. {_goes_on(self.found)}")
-        lines += begun(data, self.removed, views)
+        lines += wording.begun(data, self.removed, views)
         plain = data["untruncated"]
         if plain is not None:
             lines.append(describe_untruncated(before, plain))
@@ -259,7 +251,7 @@ def _describe_bound(found: dict[str, Any], views: int) -> str:
 
 def advise(data: dict[str, Any]) -> str | None:
     """A line for a model that lost what it knew as it came; None where nothing is left to try."""
-    photographs = data["target"] != ITSELF and data["shards"] == 1
+    photographs = data["target"] != wording.ITSELF and data["shards"] == 1
     learned = data["pressure"] is not None and data["settings"]["train"] == "all"
     if not (photographs and learned) or data["after"]["psnr"] > data["before"]["psnr"] - LOST:
         return None
@@ -275,7 +267,7 @@ def describe_untruncated(before: dict[str, Any], plain: dict[str, Any]) -> str:
     own = plain["target"] == "itself"
     compared = "against itself" if own else f"({plain['psnr'] - before['psnr']:+.2f})"
     advice = ""
-    if before["psnr"] is not None and plain["psnr"] < before["psnr"] - FELL:
+    if before["psnr"] is not None and plain["psnr"] < before["psnr"] - wording.FELL:
         advice = " For such viewers: --portable."
     return (
         f"In viewers that know no cutoffs: {plain['psnr']:.2f} dB PSNR "

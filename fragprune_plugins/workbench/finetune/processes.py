@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from itertools import accumulate
 from typing import Any
 
 import torch
@@ -37,10 +36,7 @@ class SharedStage(Stage2):
         return super().begin(opacities)
 
     def figures(self) -> list[list[float]]:
-        """Of each view drawn in this step that counts, for ``share``.
-
-        Fragments per pixel now and before, what the pressure acts on, and the loss.
-        """
+        """Of each view drawn in this step that counts, four figures for ``share``."""
         return self._views.rows()
 
     def share(self, views: Sequence[Hashable], figures: Tensor) -> None:
@@ -48,7 +44,8 @@ class SharedStage(Stage2):
 
         Args:
             views: all of this step, in the same order in every process.
-            figures: (V, 4), the rows that ``figures`` gave in the processes that drew them.
+            figures: (V, 4), the rows that ``figures`` gave in the processes that drew them:
+                fragments per pixel now and before, what the pressure acts on, and the loss.
         """
         for known, count in zip((self._before, self._after), self._visited, strict=True):
             for picture in list(known)[count:]:  # the order of what is new must be the same
@@ -68,7 +65,6 @@ class Processes:
 
     Attributes:
         first: this process writes files and speaks.
-        several: there are others.
         divided: other processes hold other Gaussians of the model.
         may_end: a signal may end the training after this step.
     """
@@ -77,12 +73,12 @@ class Processes:
     may_end = True
 
     def __init__(self, ranks: Ranks) -> None:
-        self.ranks, self.first, self.several = ranks, ranks.first, ranks.several
+        self.ranks, self.first = ranks, ranks.first
         self._due = False  # it is time for a checkpoint, some process says
 
     def expect_able(self, settings: Settings) -> None:
         """Refuse views that cannot be divided, and times, which others would disturb."""
-        if self.several and isinstance(settings.goal, Faster):
+        if self.ranks.several and isinstance(settings.goal, Faster):
             raise UsageError(
                 "target time",
                 f"{self.ranks.size} processes, which would disturb each other's measurements",
@@ -96,14 +92,6 @@ class Processes:
                 f"a multiple of {self.ranks.size}",
                 "Change --views-per-step.",
             )
-
-    def agree(self, known: dict[str, Any]) -> None:
-        """Raise RanksError if another process is about to learn something else."""
-        self.ranks.agree(known, "fine-tuning, before its first step")
-
-    def share(self, shots: Sequence[Shot]) -> Sequence[Shot]:
-        """The views of a step that this process draws."""
-        return self.ranks.share(shots)
 
     @torch.no_grad()
     def went_backward(
@@ -120,11 +108,8 @@ class Processes:
         Args:
             learned: all that learns, by name.
             due: it is time for a checkpoint after this step, by this process.
-
-        Raises:
-            RanksError: another process is gone.
         """
-        if not self.several:
+        if not self.ranks.several:
             return
         flags = [*(waiting.number == number for number in _SIGNALS), due]
         rows, leaves = stage.figures(), [*learned.values()]
@@ -136,19 +121,14 @@ class Processes:
         if came and not waiting.number:
             signal.raise_signal(came[0])  # it came to another process: all end after this step
 
-    def stepped(self, learned: Mapping[str, Tensor], step: int) -> None:
+    def stepped(self, learned: Mapping[str, Tensor], step: int, *, last: bool = False) -> None:
         """Compare all that learns, from time to time; raises RanksError if processes differ."""
-        if step % _COMPARE == 0:
-            self.finished(learned, step)
-
-    def finished(self, learned: Mapping[str, Tensor], step: int) -> None:
-        """Compare all that learns, after the last step; raises RanksError if processes differ."""
-        if self.several:
+        if self.ranks.several and (last or step % _COMPARE == 0):
             self.compare(learned, step)
 
     def keeps(self, due: bool) -> bool:
         """Whether it is time for a checkpoint after this step, as all decided in it."""
-        return self._due if self.several else due
+        return self._due if self.ranks.several else due
 
     def described(self, configuration: dict[str, Any]) -> dict[str, Any]:
         """What decides the result, in the words of all processes together."""
@@ -184,23 +164,18 @@ class Processes:
         Args:
             leaves: the tensors that learn. Their gradients are changed in place, and are there
                 afterwards if any process has one.
-            rows: four figures of each view that this process drew.
-            views: how many all processes drew.
+            rows: four figures of each view that this process drew, of ``views`` in all.
             flags: what this process noticed.
 
         Returns:
             (views, 4) figures of all views; and of each flag, whether any process has it.
-
-        Raises:
-            RanksError: another process is gone.
         """
         table = leaves[0].new_zeros(views, 4)
         if rows:
             table[self.ranks.rank :: self.ranks.size] = table.new_tensor(rows)
         noticed = table.new_tensor(flags)
         there = table.new_tensor([leaf.grad is not None for leaf in leaves])
-        told = self._told(leaves)
-        *sums, there, noticed, table = self._summed([*told, there, noticed, table])
+        *sums, there, noticed, table = self._summed([*self._told(leaves), there, noticed, table])
         for leaf, total, some in zip(leaves, sums, there.tolist(), strict=True):
             leaf.grad = self._gradient(leaf, total) if some else None
         return table, [some > 0 for some in noticed.tolist()]
@@ -216,17 +191,10 @@ class Processes:
     def _summed(self, parts: Sequence[Tensor]) -> list[Tensor]:
         flat = torch.cat([part.reshape(-1) for part in parts])
         self.ranks.sum(flat)
-        ends = accumulate(part.numel() for part in parts)
-        return [
-            flat[end - part.numel() : end].view_as(part)
-            for end, part in zip(ends, parts, strict=True)
-        ]
+        pieces = flat.split_with_sizes([part.numel() for part in parts])
+        return [piece.view_as(part) for piece, part in zip(pieces, parts, strict=True)]
 
     def compare(self, tensors: Mapping[str, Tensor], step: int) -> None:
-        """Stop unless all processes hold the same bits.
-
-        Raises:
-            RanksError: they differ.
-        """
+        """Raise RanksError unless all processes hold the same bits."""
         known = {name: fingerprint(tensor) for name, tensor in tensors.items()}
         self.ranks.agree(known, f"fine-tuning, after step {step}")

@@ -71,11 +71,7 @@ class Checkpoints:
         return self.seconds is not None and time.monotonic() - self._last >= self.seconds
 
     def save(self, tensors: dict[str, Tensor], values: dict[str, Any]) -> None:
-        """Write a checkpoint. Where it cannot be written, the one before stays, and that is told.
-
-        Raises:
-            DivergedError: a tensor holds NaN or infinity.
-        """
+        """Write a checkpoint. Where that fails, the one before stays, and somebody is told."""
         try:
             checkpoints.save(self.path, tensors, values)
         except OutputError as error:  # the fine-tuning is worth more than its checkpoint
@@ -85,11 +81,8 @@ class Checkpoints:
     def load(self, asked: dict[str, Any], device: Any) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Read the checkpoint; ({}, {}) if there is none.
 
-        Args:
-            asked: the ``configuration`` of the fine-tuning that is to go on.
-
         Raises:
-            CheckpointError: it cannot be read, or is another fine-tuning's.
+            CheckpointError: it cannot be read, or has another ``configuration`` than is asked for.
         """
         if not self.path.exists():
             return {}, {}
@@ -111,30 +104,20 @@ class Checkpoints:
 
 
 class Keeper:
-    """Takes a training over from its checkpoint, and writes the next ones.
-
-    Raises:
-        CheckpointError: the checkpoint is broken, or another fine-tuning's.
-        RanksError: another process is about to learn something else.
-    """
+    """Takes a training over from its checkpoint, and writes the next ones."""
 
     def __init__(self, checkpoints: Checkpoints | None, training: Training) -> None:
         processes = training.processes
         self.checkpoints = checkpoints if processes.first else None
-        if checkpoints is None and not processes.several:
+        if checkpoints is None and not processes.ranks.several:
             return
-        stage = training.stage
-        asked = configuration(
-            training.start,
-            training.dataset,
-            training.settings,
-            training.engine.name,
-            stage.schedule,
-        )
+        given = training.start, training.dataset, training.settings, training.engine.name
+        asked = configuration(*given, training.stage.schedule)
         self.asked = processes.described(asked) | {"loss": code_for(training.start.device)}
         if checkpoints is not None:
             self._go_on(checkpoints, training)
-        processes.agree({**self.asked, "checkpoint": training.done, "torch": torch.__version__})
+        known = {**self.asked, "checkpoint": training.done, "torch": torch.__version__}
+        processes.ranks.agree(known, "fine-tuning, before its first step")
 
     def _go_on(self, checkpoints: Checkpoints, training: Training) -> None:
         """Take over what a checkpoint holds, if there is one."""

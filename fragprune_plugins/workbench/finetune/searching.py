@@ -13,7 +13,6 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.goals import Control, Pressure
 from fragprune_plugins.learning.interruption import Terminate
 from fragprune_plugins.learning.schedule import Settings
@@ -108,13 +107,8 @@ def strongest(
     Args:
         train: makes one fine-tuning of the model.
         settings: of every training; their goal is ``AtMost``.
-
-    Raises:
-        UsageError: the goal is another one.
-        DivergedError: NaN or infinity in what trains.
     """
-    if not isinstance(settings.goal, AtMost):
-        raise UsageError("goal", str(settings.goal), "AtMost(decibels)", "Pass such a goal.")
+    assert isinstance(settings.goal, AtMost)
     say("Training the control, without pruning.")
     last = control = train(replace(settings, goal=Control()))
     found = Bounded(settings.goal.decibels, control, control)
@@ -131,13 +125,11 @@ def strongest(
             losses = [was - now for was, now in zip(reference, figures, strict=True)]
             loss, error = statistics.fmean(losses), standard_error(losses)
             trial = Trial(last.progress.pressure, loss, error, fragments)
-            say(
-                f"Loss against the control: {trial.loss:.3f} dB at {fragments:.1f} fragments/pixel."
-            )
+            say(f"Loss against the control: {loss:.3f} dB at {fragments:.1f} fragments/pixel.")
             found.take(last, trial)
             few = fragments * FEWEST < (last.progress.fragments_before or 0.0)
-            near = trial.loss >= found.bound - TOLERANCE
-            if (trial.loss <= found.bound and (few or near)) or pressure == _STRONGEST:
+            near = loss >= found.bound - TOLERANCE
+            if (loss <= found.bound and (few or near)) or pressure == _STRONGEST:
                 break
             pressure = min(next_pressure(found.trials, found.bound), _STRONGEST)
     except KeyboardInterrupt as error:  # not in a training, which ends by itself

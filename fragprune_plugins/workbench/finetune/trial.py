@@ -67,9 +67,7 @@ def tried(
     Args:
         model: not changed.
         dataset: its photographs, on the model's device.
-        settings: that were asked for.
-        keep: that was asked for.
-        engine: draws.
+        settings, keep: that were asked for.
         say: is told what is tried, and what came of it, in a sentence each.
     """
     chosen = settings.dropout is not None or settings.itself or settings.train != "all"
@@ -106,7 +104,6 @@ def forgotten(
     Args:
         model: not changed. One that is pruned already keeps its thresholds.
         dataset: its photographs, on the model's device.
-        engine: draws.
         seed: of the order of views.
         say: is told in a sentence what is tried, before.
 

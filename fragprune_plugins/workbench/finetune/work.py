@@ -59,11 +59,7 @@ class _Opened:
 
 
 def finetune(**options: Any) -> Report | None:
-    """Fine-tune, with the fields of ``Asked``; the report, in the first process.
-
-    Raises:
-        UsageError: ``out`` is no place for the result, or one process divides the model.
-    """
+    """Fine-tune, with the fields of ``Asked``; the report, in the first process."""
     asked = Asked(**options)
     if asked.shard:
         require_several()
@@ -106,8 +102,7 @@ def _open(asked: Asked) -> _Opened:
         dataset = load_photographs(photographs)
     checkpoints = Checkpoints(resuming.path_beside(asked.out), resuming.EVERY, tell=_say)
     configuration = resuming.configuration(whole, dataset, settings, engine.name)
-    configuration |= {"keep": asked.keep}
-    configuration |= {"sharded": True} if asked.shard else {}
+    configuration |= {"keep": asked.keep} | ({"sharded": True} if asked.shard else {})
     return _Opened(asked, whole, photographs, dataset, engine, device, checkpoints, configuration)
 
 

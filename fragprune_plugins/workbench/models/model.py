@@ -130,11 +130,7 @@ def save(path: str | Path, model: Model | Trained) -> None:
 
 
 def writable_folder(path: Path) -> Path:
-    """Create the folder if it is missing, and check that a file can be made in it; returns it.
-
-    Raises:
-        OutputError: the folder cannot be written.
-    """
+    """Create the folder if it is missing; returns it. OutputError if no file can be made in it."""
     path = Path(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -169,14 +165,12 @@ def require_place(out: Path, model: Path, *, thresholds: bool = True) -> None:
     if form.paired and other.suffix.lower() == ".ply":
         own, other = own.with_suffix(""), other.with_suffix("")
     if own == other:
-        raise UsageError(
-            "--out", f"{out}, the model's name", "another name", "Choose another name."
-        )
+        found = f"{out}, the model's name"
+        raise UsageError("--out", found, "another name", "Choose another name.")
     writable_folder(out.parent)
     if out.is_dir():
-        raise OutputError(
-            str(out), "a folder", f"a {form.suffix} file", "Name a file in the folder."
-        )
+        remedy = "Name a file in the folder."
+        raise OutputError(str(out), "a folder", f"a {form.suffix} file", remedy)
 
 
 def describe_written(out: Path, held: str = "", *, pruned: bool = True) -> str:

@@ -6,27 +6,20 @@ from typing import Any
 
 import click
 
+from fragprune_plugins.workbench.commands import options as shared
 from fragprune_plugins.workbench.commands.command import Command, Report, work_of
-from fragprune_plugins.workbench.commands.options import (
-    CAMERAS_APART,
-    FILE,
-    MODEL,
-    engine_options,
-    own_picture_options,
-    scene_options,
-    truncation_option,
-    views_option,
+
+
+@click.command("profile", cls=Command, rules=[shared.CAMERAS_APART])
+@click.argument("model", type=shared.MODEL)
+@shared.scene_options()
+@shared.own_picture_options
+@click.option(
+    "--out", type=shared.FILE, help="Folder for pictures: photograph, render, fragment density."
 )
-
-
-@click.command("profile", cls=Command, rules=[CAMERAS_APART])
-@click.argument("model", type=MODEL)
-@scene_options()
-@own_picture_options
-@click.option("--out", type=FILE, help="Folder for pictures: photograph, render, fragment density.")
-@views_option
-@truncation_option
-@engine_options()
+@shared.views_option
+@shared.truncation_option
+@shared.engine_options()
 def command(**options: Any) -> Report:
     """Measure MODEL: quality, fragments per pixel, time per frame.
 

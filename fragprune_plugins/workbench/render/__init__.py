@@ -6,22 +6,12 @@ from typing import Any
 
 import click
 
+from fragprune_plugins.workbench.commands import options as shared
 from fragprune_plugins.workbench.commands.command import (
     Command,
     Report,
     first_process_prints,
     work_of,
-)
-from fragprune_plugins.workbench.commands.options import (
-    CAMERAS_APART,
-    CAMERAS_HELP,
-    FILE,
-    MODEL,
-    engine_options,
-    scene_options,
-    shard_option,
-    truncation_option,
-    views_option,
 )
 from fragprune_plugins.workbench.commands.rules import Needs, apart
 
@@ -42,7 +32,7 @@ def _direction(
 _PHOTOGRAPHS = "a scene folder, which says what its images are and which are held out"
 
 RULES = (
-    CAMERAS_APART,
+    shared.CAMERAS_APART,
     Needs("--images", ("--data",), _PHOTOGRAPHS),
     Needs("--views", ("--data",), _PHOTOGRAPHS),
     *apart("--out *.mp4", "--shard-gaussians", expected="a folder for --out"),
@@ -50,11 +40,11 @@ RULES = (
 
 
 @click.command("render", cls=Command, rules=RULES)
-@click.argument("model", type=MODEL)
-@click.option("--cameras", type=FILE, help=f"{CAMERAS_HELP}.")
+@click.argument("model", type=shared.MODEL)
+@click.option("--cameras", type=shared.FILE, help=f"{shared.CAMERAS_HELP}.")
 @click.option(
     "--out",
-    type=FILE,
+    type=shared.FILE,
     required=True,
     help="Folder for the PNG files; or a film in .mp4, whose camera goes through the cameras in "
     "their order, in 8 seconds or a frame for each.",
@@ -68,11 +58,11 @@ RULES = (
     callback=_direction,
     help="With --orbit: up direction of the scene.",
 )
-@views_option
-@scene_options("Scene folder whose cameras draw, instead of --cameras.")
-@truncation_option
-@shard_option
-@engine_options()
+@shared.views_option
+@shared.scene_options("Scene folder whose cameras draw, instead of --cameras.")
+@shared.truncation_option
+@shared.shard_option
+@shared.engine_options()
 @first_process_prints()
 def command(**options: Any) -> Report | None:
     """Render MODEL from many cameras, with one PNG for each camera, or as a film.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -16,6 +16,7 @@ from torch import Tensor
 from fragprune_plugins.errors import OutputError, UsageError
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.model import Model
+from fragprune_plugins.workbench.figures.pictures import picture
 from fragprune_plugins.workbench.figures.viewing import overview
 from fragprune_plugins.workbench.scenes.generated import Named, bounds, interpolate, moved
 from fragprune_plugins.workbench.scenes.pinhole import look_at
@@ -23,19 +24,12 @@ from fragprune_plugins.workbench.scenes.pinhole import look_at
 _PICTURE: dict[str, Any] = {"width": 1280, "height": 720, "fov_y": 50.0}
 
 
-def orbit(
-    splat: Model,
-    count: int,
-    up: tuple[float, float, float] = (0.0, -1.0, 0.0),
-) -> Named:
+def orbit(splat: Model, count: int, up: tuple[float, float, float]) -> Named:
     """Cameras once around a splat, from ``overview``'s height and distance, evenly spaced.
 
     Args:
         count: cameras; the one after the last would be the first.
-        up: (3,) what is up in its world; COLMAP's worlds have y down.
-
-    Raises:
-        InputError: there is no such view.
+        up: (3,) what is up in its world.
     """
     first = overview(splat, up, **_PICTURE)
     centre, _ = bounds(splat)
@@ -69,11 +63,7 @@ def along(cameras: Named, count: int) -> Named:
 
 
 def require_encoder() -> ModuleType:
-    """The package that writes films.
-
-    Raises:
-        UsageError: it is not installed.
-    """
+    """The package that writes films; UsageError if it is not installed."""
     try:
         return importlib.import_module("imageio_ffmpeg")
     except ImportError as error:
@@ -85,46 +75,32 @@ def require_encoder() -> ModuleType:
         ) from error
 
 
-def write_mp4(path: Path, frames: Iterable[Tensor], fps: int) -> int:
+def write_mp4(path: Path, frames: Iterable[Tensor], fps: int) -> None:
     """Write pictures as an H.264 film; an existing file stays until the film is complete.
 
     Args:
         frames: (3, H, W) RGB in [0, 1] each, all of one size. A side of odd length loses its last
             row or column, because H.264 halves the colours' sides.
 
-    Returns:
-        The number of frames.
-
     Raises:
-        UsageError: imageio-ffmpeg is not installed.
         OutputError: the film cannot be written.
     """
     encoder = require_encoder()
-    count = 0
     with replacing(path) as temporary:
         writer = None
         try:
-            for pixels in _bytes(frames):
+            for frame in frames:
+                even = frame[:, : frame.shape[1] // 2 * 2, : frame.shape[2] // 2 * 2]
+                shown = picture(even)
                 if writer is None:
-                    height, width = pixels.shape[:2]
                     writer = encoder.write_frames(
-                        str(temporary), (width, height), fps=fps, macro_block_size=2, quality=8
+                        str(temporary), shown.size, fps=fps, macro_block_size=2, quality=8
                     )
                     writer.send(None)
-                writer.send(pixels.numpy().tobytes())
-                count += 1
+                writer.send(shown.tobytes())
         except OSError as error:
             why = str(error).strip().split("\n")[-1][:200]
             raise OutputError(str(path), why, "a film", "Check the place and its space.") from error
         finally:
             if writer is not None:
                 writer.close()
-    return count
-
-
-def _bytes(frames: Iterable[Tensor]) -> Iterator[Tensor]:
-    """(H, W, 3) bytes of each picture, both sides even."""
-    for frame in frames:
-        _, height, width = frame.shape
-        even = frame[:, : height // 2 * 2, : width // 2 * 2]
-        yield (255 * even.clamp(0, 1)).round().byte().permute(1, 2, 0).contiguous().cpu()

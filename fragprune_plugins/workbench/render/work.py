@@ -16,13 +16,8 @@ from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.types import RasterOutputs
+from fragprune_plugins.workbench.commands import opening
 from fragprune_plugins.workbench.commands.command import Report
-from fragprune_plugins.workbench.commands.opening import (
-    cameras_of,
-    chosen,
-    open_engine,
-    photographs_for,
-)
 from fragprune_plugins.workbench.commands.options import (
     EngineOptions,
     SceneOptions,
@@ -65,14 +60,14 @@ def render(
     film = out.suffix.lower() == ".mp4"
     _expect_place(out, film=film, shard=shard)
     if scene.data is None and not orbit:
-        cameras = cameras or cameras_of(model)
+        cameras = cameras or opening.cameras_of(model)
         _expect_cameras(cameras)
-    rasterizer, device = open_engine(engine)
+    rasterizer, device = opening.open_engine(engine)
     writable_folder(out.parent if film else out)
     whole = load(model, truncation=not no_truncation, device="cpu" if shard else device)
     if scene.data is not None:
-        dataset = load_photographs(photographs_for(model, scene))
-        named = [(shot.name, shot.view) for shot in chosen(dataset, views)]
+        dataset = load_photographs(opening.photographs_for(model, scene))
+        named = [(shot.name, shot.view) for shot in opening.chosen(dataset, views)]
     else:
         named = _views(whole, cameras, scene, up)
     if film and not orbit:
@@ -103,15 +98,10 @@ def _report(figures: dict[str, Any], wrote: str, fragments: list[float]) -> Repo
     mean = sum(fragments) / len(fragments)
     warnings = nothing_drawn(fragments)
     cut = "with cutoffs" if figures["truncated"] else "without cutoffs"
-    return Report(
-        figures | {"fragments_per_pixel": mean, "warnings": warnings},
-        "\n".join(
-            [
-                f"Wrote {wrote} ({mean:.1f} fragments per pixel, {cut}).",
-                *(f"Warning: {each}" for each in warnings),
-            ]
-        ),
-    )
+    lines = [f"Wrote {wrote} ({mean:.1f} fragments per pixel, {cut})."]
+    lines += [f"Warning: {each}" for each in warnings]
+    data = figures | {"fragments_per_pixel": mean, "warnings": warnings}
+    return Report(data, "\n".join(lines))
 
 
 def _expect_place(out: Path, *, film: bool, shard: bool) -> None:
@@ -137,10 +127,7 @@ def _expect_cameras(cameras: Path | None) -> None:
 
 
 def _views(
-    whole: Model,
-    cameras: Path | None,
-    scene: SceneOptions,
-    up: tuple[float, float, float],
+    whole: Model, cameras: Path | None, scene: SceneOptions, up: tuple[float, float, float]
 ) -> Named:
     """The named views of a file, or without one those of an orbit."""
     if cameras is not None:

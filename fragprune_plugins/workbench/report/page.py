@@ -115,7 +115,6 @@ def draw_views(
         shots: the views; they move to the models' device.
         enlarge: how many times as wide and high as the photograph both models are drawn.
     """
-
     chosen = [shot.to(original.model.xyz.device) for shot in evenly(shots, SHOWN)]
     names = stems([shot.name for shot in chosen])
     maps: dict[str, dict[str, Tensor]] = {"fragments": {}, "error": {}}
@@ -150,10 +149,10 @@ def save_banner(path: Path, folder: Path, drawn: Drawn) -> None:
     Args:
         drawn: what it gave; the first view is taken.
     """
-
     view = drawn.views[0]
+    first, second = view.fragments
     halves = []
-    for kind, said in (("", NAMES), ("_fragments", _per_pixel(view))):
+    for kind, said in (("", NAMES), ("_fragments", (f"{first} fragments per pixel", second))):
         files = [folder / f"{view.name}_{model}{kind}.png" for model in NAMES]
         left, right = (Image.open(file).convert("RGB") for file in files)
         width, height = left.size
@@ -173,14 +172,8 @@ def save_banner(path: Path, folder: Path, drawn: Drawn) -> None:
         banner.save(temporary, format="JPEG", quality=88)
 
 
-def _per_pixel(view: Shown) -> tuple[str, str]:
-    first, second = view.fragments
-    return f"{first} fragments per pixel", f"{second}"
-
-
 def shared_limit(maps: Sequence[Tensor]) -> float:
     """The value that one pixel in 200 of all maps exceeds: the top of their colour scale."""
-
     values = torch.cat([each.flatten() for each in maps]).float()
     at = min(len(values), int(0.995 * len(values)) + 1)
     return max(1.0, float(values.kthvalue(at).values))
@@ -188,7 +181,6 @@ def shared_limit(maps: Sequence[Tensor]) -> float:
 
 def figures(columns: Mapping[str, dict[str, Any]]) -> page.Table:
     """A table of measurements by name of the model, with the change between the last two."""
-
     head, *rows = tabulate(columns)
     return page.Table(head, rows, measured_with(columns))
 
@@ -204,7 +196,6 @@ def save_learning(
         curves: one dict a step, from a run's summary; None, in records, is what is not known.
         thresholds: (N,) learned, falloff; None, of a control, leaves out what shows them.
     """
-
     rows = 1 if thresholds is None else 2
     figure = Figure(figsize=(8, 2.8 * rows), layout="constrained", facecolor="none")
     FigureCanvasAgg(figure)

@@ -14,34 +14,18 @@ import torch
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import DatasetError, ModelFileError, RecordError, SidecarError
+from fragprune_plugins.files import records
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.reading import MEBIBYTE, Door, lies_in
-from fragprune_plugins.files.records import (
-    CONTROL,
-    DOOR,
-    Record,
-    control_of,
-    find,
-    located,
-    portable,
-)
+from fragprune_plugins.files.records import CONTROL, DOOR, Record
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import OwnCameras, open_engine, own_cameras
 from fragprune_plugins.workbench.commands.options import EngineOptions
+from fragprune_plugins.workbench.figures import wording
 from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.figures.page import Table, embedded
 from fragprune_plugins.workbench.figures.recorded import recorded
-from fragprune_plugins.workbench.figures.wording import (
-    IS_CONTROL,
-    PROFILED,
-    columns_of,
-    fewer,
-    gain,
-    headlines,
-    missed,
-    outcome,
-)
 from fragprune_plugins.workbench.goals import parse_goal
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.report import page as report_page
@@ -64,20 +48,21 @@ _ONLY_CONTROLS = (
 
 def report(*, folder: Path, out: Path | None, data: Path | None, engine: EngineOptions) -> Report:
     """Do what ``fragprune report`` promises; its options are the arguments."""
-    records = find(folder)
-    for record in records:
+    every = records.find(folder)
+    for record in every:
         _check(record)
-    results = [record for record in records if record.command in ("run", "finetune")]
+    results = [record for record in every if record.command in ("run", "finetune")]
     pruned = [record for record in results if _goal(record) not in (None, CONTROL)]
-    main = [*records, *results, *pruned][-1]
+    main = [*every, *results, *pruned][-1]
     control = _goal(main) == CONTROL
-    others = [record for record in records if record is not main]
-    files = [record.path for record in records]
+    others = [record for record in every if record is not main]
+    files = [record.path for record in every]
     line = _sentence(main, files)
     with TemporaryDirectory() as name:
         pictures = Path(name)
         drawn, learning, missing = _draw(main, folder, pictures, data, partial(open_engine, engine))
-        more = [*learning, *_files(records, folder, pictures)]
+        more = [*learning, *_files(every, folder, pictures)]
+        notes = [*([_ONLY_CONTROLS] if control else []), *([missing] if missing else [])]
         text = report_page.compose(
             report_page.TEMPLATE,
             drawn,
@@ -86,7 +71,7 @@ def report(*, folder: Path, out: Path | None, data: Path | None, engine: EngineO
             facts=_facts(main, files),
             quote=line,
             labels=("original", "control") if control else report_page.NAMES,
-            notes=filter(None, [_ONLY_CONTROLS if control else "", portable(missing, folder)]),
+            notes=records.portable(notes, folder),
             table=_table(main),
             plots=more,
             others=[
@@ -110,11 +95,9 @@ def report(*, folder: Path, out: Path | None, data: Path | None, engine: EngineO
         "record": str(main.path),
         "views": [view.name for view in drawn.views] if drawn else [],
         "pictures": (len(drawn.files) if drawn else 0) + len(more),
+        **{key: main.data.get(key) for key in ("before", "after", "adapter", "iterations")},
+        "notes": notes,
     }
-    summary |= {key: main.data.get(key) for key in ("before", "after", "adapter", "iterations")}
-    summary["notes"] = notes = [
-        note for note in (_ONLY_CONTROLS if control else "", missing) if note
-    ]
     return Report(summary, "\n".join([line, *notes, f"Wrote {target}."]))
 
 
@@ -137,8 +120,8 @@ def _columns(record: Record) -> dict[str, dict[str, Any]]:
     if record.command == "compare":
         return {"A": data["a"], "B": data["b"]}
     if record.command == "profile":
-        return {PROFILED[key]: each for key, each in data["columns"].items()}
-    return columns_of(data)
+        return {wording.PROFILED[key]: each for key, each in data["columns"].items()}
+    return wording.columns_of(data)
 
 
 def _table(record: Record) -> Table:
@@ -161,12 +144,12 @@ def _sentence(record: Record, among: Sequence[Path]) -> str:
     name = data.get("adapter") or ""
     of = f"{name}, {data['iterations']:,} iterations: " if name else ""
     if len(columns) > 1 and record.command in ("run", "finetune"):
-        control = data.get("control") or control_of(data, among)
-        return of + outcome(record.command, data, control)
+        control = data.get("control") or records.control_of(data, among)
+        return of + wording.outcome(record.command, data, control)
     if record.command == "compare":
         of = f"A is {data['a']['model']}, B is {data['b']['model']}: "
     if len(columns) > 1:
-        return f"{of}{gain(columns[0], columns[-1])}."
+        return f"{of}{wording.gain(columns[0], columns[-1])}."
     if columns:
         drawn, frame = columns[0]["fragments_per_pixel"], columns[0]["frame_ms"]
         return f"{drawn:.1f} fragments per pixel drawn, frames of {frame:.2f} ms."
@@ -174,10 +157,7 @@ def _sentence(record: Record, among: Sequence[Path]) -> str:
     before, after = seen["fragments_per_pixel_before"], seen["fragments_per_pixel_after"]
     if not before or not after:
         return f"{of}nothing was learned."
-    said = f"{of}{fewer(before, after)} on training views; frame times were not measured"
-    if _goal(record) == CONTROL:
-        return said + IS_CONTROL
-    return f"{said}.{missed(data)}"
+    return of + wording.outcome_in_training(data)
 
 
 def _goal(record: Record) -> str | None:
@@ -188,11 +168,9 @@ def _goal(record: Record) -> str | None:
 
 def _heading(record: Record) -> str:
     """What a record is about, in words."""
-    if record.command in ("compare", "profile"):
-        return {"compare": "Comparison", "profile": "Profile"}[record.command]
     if _goal(record) == CONTROL:
         return "The control: the same training without pruning"
-    return "Pruning"
+    return {"compare": "Comparison", "profile": "Profile"}.get(record.command, "Pruning")
 
 
 def _of(record: Record, folder: Path) -> str:
@@ -206,7 +184,7 @@ def _facts(record: Record, among: Sequence[Path]) -> list[tuple[str, str]]:
     data = record.data
     if record.command not in ("run", "finetune") or not (data.get("before") and data.get("after")):
         return []
-    return headlines(data, data.get("control") or control_of(data, among))
+    return wording.headlines(data, data.get("control") or records.control_of(data, among))
 
 
 def _settings(record: Record) -> list[list[str]]:
@@ -243,7 +221,9 @@ def _source(record: Record, data: Path | None) -> _Source | None:
     own = own_cameras(record)
     if own is not None:
         with DOOR.stated(record.path):
-            models = [located(record.data[name], record.path.parent) for name in ("model", "out")]
+            models = [
+                records.located(record.data[name], record.path.parent) for name in ("model", "out")
+            ]
         needs = list(filter(None, [own.scene.data, own.cameras]))
         pictures = own.pictures if needs else partial(_from_above, own)
         return _Source(models, False, {}, needs, pictures)
@@ -309,13 +289,13 @@ def _draw(
     return report_page.draw_views(folder, before, after, dataset.test, engine), learning, ""
 
 
-def _files(records: list[Record], inside: Path, folder: Path) -> list[tuple[str, str]]:
+def _files(every: list[Record], inside: Path, folder: Path) -> list[tuple[str, str]]:
     """Copy pictures of compare and profile into the folder; returns (heading, file) of each.
 
     Only PNGs beside the record, and no link out of ``inside``.
     """
     found: list[tuple[str, str]] = []
-    for record in records:
+    for record in every:
         for name in record.data.get("files", ()):
             file = record.path.parent / Path(name).name
             if not lies_in(file, inside):

@@ -25,18 +25,9 @@ from fragprune_plugins.workbench.commands.command import JSON, Report
 from fragprune_plugins.workbench.commands.logs import Bar, logging_steps
 from fragprune_plugins.workbench.commands.opening import bound_threads, open_engine
 from fragprune_plugins.workbench.commands.options import EngineOptions
+from fragprune_plugins.workbench.figures import wording
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
 from fragprune_plugins.workbench.figures.recorded import Recorded
-from fragprune_plugins.workbench.figures.wording import (
-    IS_CONTROL,
-    begun,
-    columns_of,
-    describe,
-    fewer,
-    missed,
-    next_steps,
-    outcome,
-)
 from fragprune_plugins.workbench.finetune.trial import Trial, tried
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.pruning import best, removal_error
@@ -153,10 +144,7 @@ def _text(path: Path | None) -> str | None:
 
 
 def photographs_of(summary: launch.RunSummary) -> Recorded | None:
-    """How to read the host's data and draw its models; None if they cannot be measured.
-
-    Joint learning leaves one model.
-    """
+    """How to read the host's data and draw its models; None if they cannot be measured."""
     if not summary.photographs:
         return None
     left = tuple(path for path in (summary.model_before, summary.model_after) if path)
@@ -164,11 +152,7 @@ def photographs_of(summary: launch.RunSummary) -> Recorded | None:
 
 
 def measure_models(read: Recorded, engine: EngineOptions) -> list[dict[str, Any]]:
-    """Measure the models on held-out views, on the host's device if an engine can draw there.
-
-    Returns:
-        The measurements before and after; after joint learning the latter alone.
-    """
+    """Measure the models on held-out views, on the host's device if an engine can draw there."""
     device = "cpu" if engine.device == "cpu" else "auto"
     rasterizer, where = open_engine(EngineOptions(engine.name, device))
     dataset = load_photographs(read.photographs)
@@ -187,20 +171,16 @@ def _describe(
         )
     if not summary.steps:
         return f"{summary.adapter}: the host ended; nothing was learned (--stage {summary.stage})."
-    lines = []
     control = summary.settings["goal"] == records.CONTROL
+    lines = [wording.describe(wording.columns_of(data)), ""] if data["after"] else []
     if data["before"]:
-        lines += [describe(columns_of(data)), "", outcome("run", data, data["control"])]
-        lines += begun(data, data["before"]["gaussians"] - data["after"]["gaussians"])
+        lines.append(wording.outcome("run", data, data["control"]))
+        lines += wording.begun(data, data["before"]["gaussians"] - data["after"]["gaussians"])
     else:
-        if data["after"]:
-            lines += [describe(columns_of(data)), "", *([] if control else [_CONTROL])]
+        if data["after"] and not control:
+            lines.append(_CONTROL)
         if summary.fragments_before and summary.fragments_after:
-            change = fewer(summary.fragments_before, summary.fragments_after)
-            lines.append(
-                f"{change} on training views; frame times were not measured"
-                f"{IS_CONTROL if control else f'.{missed(data)}'}"
-            )
+            lines.append(wording.outcome_in_training(data))
         if not_compared:
             why = f"{not_compared.where}: {not_compared.found}. {not_compared.remedy}"
             lines.append(f"Not compared on held-out views because of {why}")
@@ -215,7 +195,7 @@ def _describe(
     if summary.model_after and summary.output:
         scene = summary.photographs.folder if summary.photographs else None
         shown = summary.model_after if _viewable(summary.model_after) else None
-        lines.append(next_steps(shown, summary.output, scene))
+        lines.append(wording.next_steps(shown, summary.output, scene))
     return "\n".join(lines)
 
 
@@ -239,12 +219,7 @@ def _viewable(model: Path) -> bool:
 
 @dataclass
 class Looking:
-    """What ``RunOptions.look`` calls.
-
-    Attributes:
-        engine: draws.
-        trial: what was found; None before, and where nothing could be tried.
-    """
+    """What ``RunOptions.look`` calls; ``trial`` is None where nothing could be tried."""
 
     engine: EngineOptions
     trial: Trial | None = None

@@ -97,13 +97,5 @@ def _camera(entry: dict[str, Any]) -> Camera:
     rotation = matrix(entry["rotation"], (3, 3)).T.contiguous()
     position = matrix(entry["position"], (3,))
     width, height = int(entry["width"]), int(entry["height"])
-    return Camera(
-        rotation,
-        -rotation @ position,
-        width,
-        height,
-        float(entry["fx"]),
-        float(entry["fy"]),
-        width / 2,
-        height / 2,
-    )
+    lens = float(entry["fx"]), float(entry["fy"]), width / 2, height / 2
+    return Camera(rotation, -rotation @ position, width, height, *lens)

@@ -66,13 +66,9 @@ def find_model(folder: Path) -> Path | None:
 
 
 def read(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]]:
-    """Read training and held-out views.
-
-    Raises:
-        DatasetError: a file is broken, an image has no camera, or a lens cannot be straightened.
-    """
+    """Read training and held-out views of a folder in which ``find_model`` finds something."""
     model = find_model(folder)
-    assert model is not None, "the caller looked"
+    assert model is not None
     # Binary first, as hosts do: COLMAP writes binary files, and text files are an export.
     if (model / "images.bin").exists():
         found = model / "cameras.bin", model / "images.bin"

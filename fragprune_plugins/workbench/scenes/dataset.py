@@ -158,8 +158,8 @@ class Photograph(Shot):
         size = (self.view.width, self.view.height)
         with opened(self.path) as file:
             whole = file.size
-            transparent = "A" in file.getbands() or "transparency" in file.info
-            picture = self._fitted(file.convert("RGBA" if transparent else "RGB"), size)
+            mode = "RGBA" if file.has_transparency_data else "RGB"
+            picture = self._fitted(file.convert(mode), size)
         flat = _over(picture, 255 * self.view.background.cpu().numpy())
         if self.mask is not None:
             with opened(self.mask) as file:
@@ -255,22 +255,16 @@ def read_scene(folder: Path, images: str = "images") -> tuple[list[Posed], list[
     """Read the training and the held-out cameras of a scene, and where their images should be.
 
     No image is opened, but for the size of one whose transforms file has no ``w`` and ``h``.
-
-    Raises:
-        DatasetError: the folder has neither layout or both, a file is broken, a camera model is
-            unknown, or there are no training or no held-out cameras.
+    DatasetError as of ``load_dataset``.
     """
-    folder = Path(folder)
     if not os.path.isdir(folder):  # False for a name that no folder can have, too
-        raise DatasetError(
-            str(folder), "no such folder", "a folder with photographs", "Check --data."
-        )
+        expected = "a folder with photographs"
+        raise DatasetError(str(folder), "no such folder", expected, "Check --data.")
     model = colmap.find_model(folder)
     has_transforms = transforms.has_transforms(folder)
     if model is not None and has_transforms and model != folder / colmap.NERFSTUDIOS:
-        raise DatasetError(
-            str(folder), "both COLMAP's and a transforms layout", _LAYOUTS, "Move one aside."
-        )
+        found = "both COLMAP's and a transforms layout"
+        raise DatasetError(str(folder), found, _LAYOUTS, "Move one aside.")
     if model is None and not has_transforms:
         raise DatasetError(str(folder), "neither layout", _LAYOUTS, _where_else(folder))
     images = _image_folder(folder, images)
@@ -308,11 +302,7 @@ def _image_folder(folder: Path, images: str) -> str:
 
 
 def make_shot(row: Posed, background: Tensor, resolution: Resolution) -> Photograph:
-    """Pair an image file with its camera. This reads only the file's header.
-
-    Raises:
-        DatasetError: the file is missing or unreadable, or its size does not fit the camera.
-    """
+    """Pair an image file with its camera. This reads only the file's header."""
     width, height = image_size(row.image)
     camera = row.camera
     _expect_aspect(row.image, (width, height), "its camera", (camera.width, camera.height))

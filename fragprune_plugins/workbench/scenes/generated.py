@@ -12,7 +12,7 @@ import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar, TypeVar
+from typing import ClassVar
 
 import torch
 from scipy.spatial.transform import Rotation
@@ -26,12 +26,10 @@ from fragprune_plugins.types import RasterInputs, View, one_line
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 from fragprune_plugins.workbench.scenes.pinhole import look_at
-from fragprune_plugins.workbench.scenes.posed import HOLD_OUT
+from fragprune_plugins.workbench.scenes.posed import hold_out
 
 Named = list[tuple[str, View]]
 """Names of views, and the views."""
-
-Item = TypeVar("Item")
 
 ORBIT_VIEWS = 96
 """Cameras that ``around`` gives by default."""
@@ -73,8 +71,6 @@ def around(
     They look at its robust centre from where nine tenths of it fill the picture, or from nearer.
 
     Args:
-        splat: N Gaussians.
-        count: cameras.
         pixels: of each side of their pictures.
         background: (3,) RGB; black when None.
         seed: of the distances.
@@ -116,12 +112,11 @@ def _direction(number: int, count: int, steepest: float = 1.0) -> Tensor:
 def between(cameras: Named, *, seed: int = 0) -> Named:
     """Cameras between each given one and those near it, in place and in what they look at.
 
+    There are up to four for each camera: none towards one that looks more than a quarter turn away.
+
     Args:
         cameras: the given ones, on one device.
         seed: of how far each is on the way.
-
-    Returns:
-        Up to four for each camera: none towards one that looks more than a quarter turn away.
     """
     stream = random.Random(seed)
     return [
@@ -134,13 +129,12 @@ def between(cameras: Named, *, seed: int = 0) -> Named:
 def beside(cameras: Named, count: int, *, seed: int = 0) -> Named:
     """Cameras next to given ones: on the way to one nearby, or on the way away from it.
 
+    There are none if no two of the given ones look the same way.
+
     Args:
         cameras: the given ones, on one device.
         count: of cameras; they take turns at being next to each given one.
         seed: of which one is nearby, and how far the way is.
-
-    Returns:
-        So many; none if no two of the given ones look the same way.
     """
     stream, found = random.Random(seed), []
     near = [(i, others) for i, others in enumerate(_neighbours(cameras)) if others]
@@ -186,8 +180,6 @@ def interpolate(a: View, b: View, t: float) -> View:
     interpolation of theirs, the short way round.
 
     Args:
-        a: where ``t`` is 0.
-        b: where ``t`` is 1.
         t: 0 to 1 on the way; outside, straight on and turning on.
     """
     one, other = (view.viewmatrix.detach().double().cpu() for view in (a, b))
@@ -211,23 +203,6 @@ def moved(view: View, viewmatrix: Tensor, campos: Tensor) -> View:
         projmatrix=(matrix @ lens).to(view.projmatrix),
         campos=campos.to(view.campos),
     )
-
-
-def hold_out(items: Sequence[Item]) -> tuple[list[Item], list[Item]]:
-    """Every 8th for measuring, the rest to learn from: the rest, and every 8th.
-
-    Raises:
-        DatasetError: there is nothing to learn from.
-    """
-    if len(items) < 2:
-        raise DatasetError(
-            "cameras",
-            f"{len(items)}",
-            "at least two: the first of each eight is held out for the figures",
-            "Pass more cameras.",
-        )
-    rest = [item for index, item in enumerate(items) if index % HOLD_OUT]
-    return rest, list(items[::HOLD_OUT])
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,6 +254,9 @@ def own_pictures(
     draw = _drawing(model, engine)
     views = around(model, seed=seed) if cameras is None else cameras
     if held_out is None:
+        if len(views) < 2:
+            expected = "at least two: the first of each eight is held out for the figures"
+            raise DatasetError("cameras", f"{len(views)}", expected, "Pass more cameras.")
         views, held_out = hold_out(views)
     train, test = (
         [OwnPicture(name, view, draw) for name, view in part]
@@ -289,7 +267,7 @@ def own_pictures(
 
 def _drawing(model: Model, engine: str | Engine) -> Callable[[View], Tensor]:
     """Draws a model as it is now, (3, H, W)."""
-    drawer = engine_for(engine, model.device) if isinstance(engine, str) else engine
+    drawer = engine_for(engine, model.device)
     splats, thresholds = model.splats(), model.falloff
 
     @torch.no_grad()

@@ -67,27 +67,17 @@ def opened(path: Path) -> Iterator[Image.Image]:
         with Image.open(reading.file, formats=_FORMATS) as image:
             width, height = image.size
             if width * height > PIXELS_MAX or max(width, height) > SIDE_MAX:
-                raise DatasetError(
-                    str(path),
-                    f"{width}x{height} pixels",
-                    f"at most {PIXELS_MAX:,} pixels, and {SIDE_MAX:,} a side",
-                    "Make the image smaller.",
-                )
+                expected = f"at most {PIXELS_MAX:,} pixels, and {SIDE_MAX:,} a side"
+                found = f"{width}x{height} pixels"
+                raise DatasetError(str(path), found, expected, "Make the image smaller.")
             if image.mode in _CUT or image.mode.startswith("I;16"):
-                raise DatasetError(
-                    str(path),
-                    f"pixels of mode {image.mode}, which would all be cut to 8 bits",
-                    "8 bits a channel",
-                    "Save the image with 8 bits a channel.",
-                )
+                found = f"pixels of mode {image.mode}, which would all be cut to 8 bits"
+                remedy = "Save the image with 8 bits a channel."
+                raise DatasetError(str(path), found, "8 bits a channel", remedy)
             yield image
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image file, pixels. Only its header is read.
-
-    Raises:
-        DatasetError: the file is missing or not an image.
-    """
+    """Width and height of an image file, pixels. Only its header is read."""
     with opened(path) as image:
         return image.size

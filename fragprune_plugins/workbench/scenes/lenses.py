@@ -23,12 +23,9 @@ class Lens:
     """A lens by OpenCV's models, in COLMAP's pixel convention.
 
     Attributes:
-        width: pixels of the photograph that the numbers belong to.
-        height: pixels.
-        fx: focal length, pixels.
-        fy: focal length, pixels.
-        cx: principal point, pixels; 0.5 is the middle of the first pixel.
-        cy: principal point, pixels.
+        width, height: pixels of the photograph that the numbers belong to.
+        fx, fy: focal lengths, pixels.
+        cx, cy: principal point, pixels; 0.5 is the middle of the first pixel.
         coefficients: k1, k2, p1, p2, k3, k4, k5, k6; of a fisheye k1, k2, k3, k4.
         fisheye: whether the model is OpenCV's (and COLMAP's) fisheye.
     """
@@ -58,13 +55,8 @@ class Lens:
 
         It has as many pixels, and sees as much as it can without a pixel that the photograph lacks.
 
-        Args:
-            rotation: (3, 3) float64, world to camera.
-            translation: (3,) float64.
-
         Raises:
             DatasetError: the lens has distortion, and OpenCV is not installed.
-            InputError: the numbers are not plausible.
         """
         own = self._camera(rotation, translation)
         if self.straight:

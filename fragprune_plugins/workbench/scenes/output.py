@@ -39,9 +39,8 @@ def newest_model(folder: Path) -> Path:
         ModelFileError: there is none, or several output folders lie in the folder.
     """
     outputs = {each.parent for each in folder.glob("*/point_cloud")}
-    inside = (
-        outputs.pop() if len(outputs) == 1 and not (folder / "point_cloud").exists() else folder
-    )
+    one = len(outputs) == 1 and not (folder / "point_cloud").exists()
+    inside = outputs.pop() if one else folder
     found = [
         (int(number[1]), path)
         for path in inside.glob("point_cloud/iteration_*/point_cloud.ply")

@@ -29,12 +29,9 @@ class Camera:
     Attributes:
         rotation: (3, 3) float64, world to camera (x right, y down, z forward).
         translation: (3,) float64.
-        width: pixels.
-        height: pixels.
-        fx: focal length, pixels.
-        fy: focal length, pixels.
-        cx: principal point, pixels; width / 2 is the centre.
-        cy: principal point, pixels.
+        width, height: pixels.
+        fx, fy: focal lengths, pixels.
+        cx, cy: principal point, pixels; width / 2 is the centre.
     """
 
     rotation: Tensor
@@ -55,28 +52,12 @@ class Camera:
     def resized(self, width: int, height: int) -> Camera:
         """The same camera with another number of pixels."""
         x, y = width / self.width, height / self.height
-        return replace(
-            self,
-            width=width,
-            height=height,
-            fx=self.fx * x,
-            fy=self.fy * y,
-            cx=self.cx * x,
-            cy=self.cy * y,
-        )
+        focal, centre = (self.fx * x, self.fy * y), (self.cx * x, self.cy * y)
+        return Camera(self.rotation, self.translation, width, height, *focal, *centre)
 
     def view(self, background: Tensor | None = None) -> View:
         """The camera as a view for engines, computed in float64, float32 in the result."""
-        exact = View.pinhole(
-            self.rotation,
-            self.translation,
-            width=self.width,
-            height=self.height,
-            fx=self.fx,
-            fy=self.fy,
-            cx=self.cx,
-            cy=self.cy,
-        )
+        exact = View.pinhole(**vars(self))
         return replace(
             exact,
             viewmatrix=exact.viewmatrix.float(),
@@ -87,11 +68,7 @@ class Camera:
 
 
 def check_pose(rotation: Tensor, translation: Tensor) -> None:
-    """Check that tensors are a camera's pose: see ``Camera``. Waits for a GPU.
-
-    Raises:
-        InputError: not a rotation matrix, or the camera is not within ``DISTANCE_MAX``.
-    """
+    """Raise InputError unless it is a rotation, and a place within ``DISTANCE_MAX``."""
     require_tensor("rotation", rotation, 3, 3)
     require_tensor("translation", translation, 3)
     exact = rotation.detach().double()

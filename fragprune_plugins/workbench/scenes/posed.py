@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from fragprune_plugins.workbench.scenes.lenses import Lens
 from fragprune_plugins.workbench.scenes.pinhole import Camera
 
 log = logging.getLogger("fragprune")
+
+Item = TypeVar("Item")
 
 HOLD_OUT = 8
 """Views 0, 8, 16, ... of the sorted names are held out (hosts' llffhold)."""
@@ -33,14 +36,18 @@ class Posed(NamedTuple):
     mask: Path | None = None
 
 
+def hold_out(items: Sequence[Item]) -> tuple[list[Item], list[Item]]:
+    """The items to learn from, and every 8th for measuring, from the first on."""
+    return [item for index, item in enumerate(items) if index % HOLD_OUT], [*items[::HOLD_OUT]]
+
+
 def split(rows: list[Posed]) -> tuple[list[Posed], list[Posed]]:
     """The training views and the held-out views of a scene that does not say which they are.
 
     Hosts sort by names without their suffix and folder, 3DGS since October 2024 by whole names. It
     is warned of where that holds out other views.
     """
-    ordered = sorted(rows, key=lambda row: Path(row.name).stem)
-    train, test = [row for i, row in enumerate(ordered) if i % HOLD_OUT], ordered[::HOLD_OUT]
+    train, test = hold_out(sorted(rows, key=lambda row: Path(row.name).stem))
     whole = sorted(row.name for row in rows)[::HOLD_OUT]
     if set(whole) != {row.name for row in test}:
         log.warning(

@@ -52,9 +52,6 @@ def read(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]
 
     Args:
         images: name of the folder with the images, if it is another than the file says.
-
-    Raises:
-        DatasetError: a file or image is missing or broken, or a lens cannot be straightened.
     """
     if (folder / PAIR[0]).exists():
         train, test = (read_transforms(folder / name, images) for name in PAIR)
@@ -99,9 +96,8 @@ def matrix(values: Any, *shapes: tuple[int, ...]) -> torch.Tensor:
     """Nested lists of numbers as float64, in one of the shapes; raises ValueError."""
     found = torch.tensor(values, dtype=torch.float64)
     if tuple(found.shape) not in shapes:
-        raise ValueError(
-            f"numbers of shape {tuple(found.shape)}, not {' or '.join(map(str, shapes))}"
-        )
+        expected = " or ".join(map(str, shapes))
+        raise ValueError(f"numbers of shape {tuple(found.shape)}, not {expected}")
     return found
 
 
@@ -128,23 +124,15 @@ def _row(folder: Path, frame: dict[str, Any], images: str) -> Posed:
     listed = Path(frame["file_path"])
     image = find_image(folder / (listed if images == "images" else Path(images) / listed.name))
     width, height = (int(frame["w"]), int(frame["h"])) if "w" in frame else image_size(image)
-    fx = (
-        float(frame["fl_x"])
-        if "fl_x" in frame
-        else width / (2 * math.tan(float(frame["camera_angle_x"]) / 2))
-    )
-    pose = opengl_pose(matrix(frame["transform_matrix"], (4, 4), (3, 4))[:3])
+    if "fl_x" in frame:
+        fx = float(frame["fl_x"])
+    else:
+        fx = width / (2 * math.tan(float(frame["camera_angle_x"]) / 2))
+    usual = {"fl_y": fx, "cx": width / 2, "cy": height / 2}
+    fy, cx, cy = (float(frame.get(name, number)) for name, number in usual.items())
     fisheye, coefficients = _distortion(frame)
-    lens = Lens(
-        width,
-        height,
-        fx,
-        float(frame.get("fl_y", fx)),
-        float(frame.get("cx", width / 2)),
-        float(frame.get("cy", height / 2)),
-        coefficients,
-        fisheye,
-    )
+    lens = Lens(width, height, fx, fy, cx, cy, coefficients, fisheye)
+    pose = opengl_pose(matrix(frame["transform_matrix"], (4, 4), (3, 4))[:3])
     return Posed(
         _name(listed),
         lens.camera(*pose),

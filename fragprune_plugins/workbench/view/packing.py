@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from fragprune_plugins.constants import ALPHA_MIN
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.workbench.models.formats.values import z_order
+from fragprune_plugins.workbench.models.formats.arrays import z_order
 
 CUTOFF_MAX = -2 * math.log(ALPHA_MIN)
 """The largest cutoff that decides anything: a fragment beyond it is fainter than 1/255."""
@@ -117,8 +117,7 @@ def compact(tables: bytes, facts: dict[str, Any]) -> tuple[bytes, dict[str, int]
     """Tables in few bytes.
 
     Args:
-        tables: from ``packing.pack``.
-        facts: likewise.
+        tables, facts: from ``pack``.
 
     Returns:
         The bytes; ``bits`` and ``rows`` for the facts; what was rounded, as words for the user.
@@ -192,11 +191,8 @@ def _planes(numbers: NDArray[Any]) -> Bytes:
 
 def _rotations(turns: NDArray[np.int16]) -> tuple[Bytes, bool]:
     """(N, 4) bytes of quaternions, and whether they are farther off than by a unit."""
-    rows, sizes, unit = (
-        np.arange(len(turns)),
-        np.abs(turns.astype(np.int32)),
-        32767 * 0.5**0.5 / 511,
-    )
+    rows, sizes = np.arange(len(turns)), np.abs(turns.astype(np.int32))
+    unit = 32767 * 0.5**0.5 / 511
     codes = np.rint(sizes / unit).astype(np.int32)
     off = np.abs(np.rint(codes * unit) - sizes)
     # Of components that are nearly as large the one that fits least: a .spz file has left it out.

@@ -43,15 +43,7 @@ SINGLE_MAX = 64 << 20
 
 _SAFE = bytes.maketrans(b"<&", b",.")  # of base 85, so that no text ends or hides an element
 
-_MODULES = (
-    "shaders.js",
-    "compact.js",
-    "sorting.js",
-    "splats.js",
-    "camera.js",
-    "drawing.js",
-    "main.js",
-)
+_MODULES = ("shaders", "compact", "sorting", "splats", "camera", "drawing", "main")  # in this order
 _PHOTOGRAPH_SIDE = 960
 
 
@@ -96,9 +88,6 @@ def make_site(
         layers: one or two; the first is on the left.
         cameras: to choose from; may be none.
         start: the first camera; its background is the page's.
-
-    Raises:
-        DatasetError: a photograph cannot be read.
     """
     site = {each.name: each.read_bytes() for each in sorted(STATIC.iterdir()) if each.is_file()}
     described = []
@@ -145,11 +134,7 @@ def camera(view: View) -> dict[str, Any]:
 
 
 def save_site(folder: Path, site: Site) -> None:
-    """Write a viewer's files into a folder, which any web server can serve.
-
-    Raises:
-        OutputError: the folder cannot be written.
-    """
+    """Write a viewer's files into a folder, which any web server can serve."""
     for name, content in site.items():
         path = Path(folder, *name.split("/"))
         writable_folder(path.parent)
@@ -174,10 +159,7 @@ def compacted(site: Site) -> tuple[Site, list[str]]:
 
 
 def single_page(site: Site) -> bytes:
-    """A viewer as one HTML file, which a browser opens from disk.
-
-    Args:
-        site: the viewer, better ``compacted``.
+    """A viewer, better ``compacted``, as one HTML file, which a browser opens from disk.
 
     Raises:
         OutputError: it is larger than ``SINGLE_MAX``.
@@ -185,15 +167,11 @@ def single_page(site: Site) -> bytes:
     data = {name: each for name, each in site.items() if not (STATIC / name).is_file()}
     size = sum(map(len, data.values()))
     if size > SINGLE_MAX:
-        raise OutputError(
-            "--out",
-            f"{size >> 20} MiB of data",
-            f"at most {SINGLE_MAX >> 20} MiB in one page",
-            "Name a folder.",
-        )
+        expected = f"at most {SINGLE_MAX >> 20} MiB in one page"
+        raise OutputError("--out", f"{size >> 20} MiB of data", expected, "Name a folder.")
     # Names of all modules differ, so that one after the other they are one module.
     code = "\n".join(
-        re.sub(r"^(import .*|export (?=\w))", "", site[name].decode(), flags=re.MULTILINE)
+        re.sub(r"^(import .*|export (?=\w))", "", site[f"{name}.js"].decode(), flags=re.MULTILINE)
         for name in _MODULES
     )
     held = "".join(
@@ -244,10 +222,7 @@ _KINDS = {
 
 
 def open_server(site: Site, port: int = 0) -> ThreadingHTTPServer:
-    """A server of these files, bound to 127.0.0.1; ``serve_forever`` runs it.
-
-    Args:
-        port: 0 for any free one.
+    """A server of these files, bound to 127.0.0.1 and a port; 0 takes any free one.
 
     Raises:
         OutputError: the port cannot be had.
@@ -255,9 +230,8 @@ def open_server(site: Site, port: int = 0) -> ThreadingHTTPServer:
     try:
         return _Server((HOST, port), partial(_Handler, site))
     except OSError as error:
-        raise OutputError(
-            f"{HOST}:{port}", error.strerror or str(error), "a free port", "Leave out --port."
-        ) from error
+        found = error.strerror or str(error)
+        raise OutputError(f"{HOST}:{port}", found, "a free port", "Leave out --port.") from error
 
 
 def address(server: ThreadingHTTPServer) -> str:

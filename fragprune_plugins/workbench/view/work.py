@@ -156,11 +156,8 @@ def _expect_our_page(page: Path) -> None:
     if not page.is_file():
         return
     with open(page, "rb") as file:
-        ours = b'content="fragprune view"' in file.read(4096)
-    if not ours:
-        raise OutputError(
-            str(page),
-            "a page that fragprune view did not write",
-            "no page there, or one of fragprune view",
-            "Choose another --out, or delete the page.",
-        )
+        if b'content="fragprune view"' in file.read(4096):
+            return
+    found = "a page that fragprune view did not write"
+    expected = "no page there, or one of fragprune view"
+    raise OutputError(str(page), found, expected, "Choose another --out, or delete the page.")

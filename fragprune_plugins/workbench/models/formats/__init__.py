@@ -77,11 +77,7 @@ _DOOR = Door(
 
 @cache
 def of_suffix(suffix: str) -> Format:
-    """The format with one of ``SUFFIXES``.
-
-    Raises:
-        PluginError: its package cannot be loaded.
-    """
+    """The format with one of ``SUFFIXES``; PluginError if its package cannot be loaded."""
     if suffix == PLY.suffix:
         return PLY
     form: Format = load(offered(GROUP)[suffix.removeprefix(".")], Format)
@@ -89,17 +85,11 @@ def of_suffix(suffix: str) -> Format:
 
 
 def named(path: Path) -> Format:
-    """The format that a file to write gets by its name.
-
-    Raises:
-        OutputError: no format has this suffix.
-        PluginError: the format's package cannot be loaded.
-    """
+    """The format that a file to write gets by its name; OutputError if none has this suffix."""
     fitting = [suffix for suffix in SUFFIXES if path.name.lower().endswith(suffix)]
     if not fitting:
-        raise OutputError(
-            str(path), "not the name of a model", "a name in " + ", ".join(SUFFIXES), "Rename it."
-        )
+        expected = "a name in " + ", ".join(SUFFIXES)
+        raise OutputError(str(path), "not the name of a model", expected, "Rename it.")
     return of_suffix(max(fitting, key=len))
 
 
@@ -161,10 +151,11 @@ def write(form: Format, new: Path, model: Model) -> None:
         try:
             form.write(file, model.to("cpu"))
         except ValueError as error:
-            found = f"a {form.name} file, which cannot hold {error}"
-            raise OutputError(
-                new.name, found, "another format", "Choose another suffix."
-            ) from error
+            found, remedy = (
+                f"a {form.name} file, which cannot hold {error}",
+                "Choose another suffix.",
+            )
+            raise OutputError(new.name, found, "another format", remedy) from error
 
 
 def expect_carrier(form: Format, path: Path) -> None:

@@ -15,17 +15,7 @@ import numpy.typing as npt
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.ply_table import HEADER_MAX, header_lines, read_elements
 from fragprune_plugins.files.reading import Reading
-from fragprune_plugins.workbench.models.formats import Format
-from fragprune_plugins.workbench.models.formats.values import (
-    SH_C0,
-    array,
-    morton_order,
-    opacities_of,
-    quaternions_of,
-    splat_of,
-    with_largest,
-    without_largest,
-)
+from fragprune_plugins.workbench.models.formats import Format, arrays
 
 _CHUNK = 256
 _SCALE_LIMIT = 20.0  # of logarithms, as the format's own writer has it
@@ -79,9 +69,9 @@ def read(reading: Reading) -> Model:
         raise ValueError("another number of rows of sh than of Gaussians")
     fractions = (coefficients + 0.5) / 256
     fractions[coefficients == 0], fractions[coefficients == 255] = 0, 1
-    return splat_of(
+    return arrays.splat_of(
         xyz=ranged(_unpacked(position, (11, 10, 11)), "position"),
-        colours=(rgb - 0.5) / SH_C0,
+        colours=(rgb - 0.5) / arrays.SH_C0,
         rest=(8 * (fractions - 0.5)).reshape(count, 3, -1).transpose(0, 2, 1),
         opacities=rgba[:, 3],
         log_scales=ranged(_unpacked(scale, (11, 10, 11)), "scale"),
@@ -91,7 +81,7 @@ def read(reading: Reading) -> Model:
 
 def write(file: BinaryIO, splat: Model) -> None:
     """Write the Gaussians along a Z-order curve; the registry has refused thresholds."""
-    splat = splat.keep(morton_order(splat))
+    splat = splat.keep(arrays.morton_order(splat))
     count, starts = len(splat), np.arange(0, len(splat), _CHUNK)
     of = np.arange(count) // _CHUNK
     ranges: dict[str, npt.NDArray[Any]] = {}
@@ -103,13 +93,13 @@ def write(file: BinaryIO, splat: Model) -> None:
         wide = np.where(high - low < 1e-5, np.inf, high - low)
         return (values - low[of]) / wide[of]
 
-    xyz = _packed(packed(array(splat.xyz), "position"), (11, 10, 11))
-    limited = np.clip(array(splat.scaling), -_SCALE_LIMIT, _SCALE_LIMIT)
+    xyz = _packed(packed(arrays.array(splat.xyz), "position"), (11, 10, 11))
+    limited = np.clip(arrays.array(splat.scaling), -_SCALE_LIMIT, _SCALE_LIMIT)
     scales = _packed(packed(limited, "scale"), (11, 10, 11))
-    rgb = packed(0.5 + SH_C0 * array(splat.f_dc)[:, 0], "colour")
-    rgba = _packed(np.concatenate([rgb, opacities_of(splat)[:, None]], axis=1), (8, 8, 8, 8))
-    vertex = np.stack([xyz, _packed_rotations(quaternions_of(splat)), scales, rgba], axis=1)
-    rest = array(splat.f_rest).transpose(0, 2, 1).reshape(count, -1)
+    rgb = packed(0.5 + arrays.SH_C0 * arrays.array(splat.f_dc)[:, 0], "colour")
+    rgba = _packed(np.concatenate([rgb, arrays.opacities_of(splat)[:, None]], axis=1), (8, 8, 8, 8))
+    vertex = np.stack([xyz, _packed_rotations(arrays.quaternions_of(splat)), scales, rgba], axis=1)
+    rest = arrays.array(splat.f_rest).transpose(0, 2, 1).reshape(count, -1)
     sh = np.clip(np.trunc(256 * (rest / 8 + 0.5)), 0, 255).astype(np.uint8)
     lines = ["ply", "format binary_little_endian 1.0", f"element chunk {len(starts)}"]
     lines += [f"property float {name}" for name in ranges]
@@ -127,9 +117,8 @@ def _unpacked(packed: npt.NDArray[np.uint32], bits: tuple[int, ...]) -> npt.NDAr
     fields, at = [], sum(bits)
     for width in bits:
         at -= width
-        fields.append(
-            ((packed >> np.uint32(at)) & np.uint32((1 << width) - 1)) / ((1 << width) - 1)
-        )
+        most = (1 << width) - 1
+        fields.append(((packed >> np.uint32(at)) & np.uint32(most)) / most)
     return np.stack(fields, axis=1)
 
 
@@ -145,11 +134,11 @@ def _packed(fractions: npt.NDArray[Any], bits: tuple[int, ...]) -> npt.NDArray[n
 def _rotations(packed: npt.NDArray[np.uint32]) -> npt.NDArray[Any]:
     """Quaternions from three components of 10 bits and the index of the largest."""
     three = (_unpacked(packed & np.uint32((1 << 30) - 1), (10, 10, 10)) - 0.5) / _HALF_SQRT2
-    return with_largest(packed >> np.uint32(30), three)
+    return arrays.with_largest(packed >> np.uint32(30), three)
 
 
 def _packed_rotations(quaternions: npt.NDArray[Any]) -> npt.NDArray[np.uint32]:
-    largest, three = without_largest(quaternions)
+    largest, three = arrays.without_largest(quaternions)
     packed = _packed(three * _HALF_SQRT2 + 0.5, (10, 10, 10))
     result: npt.NDArray[np.uint32] = packed | (largest.astype(np.uint32) << np.uint32(30))
     return result

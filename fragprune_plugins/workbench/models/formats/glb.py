@@ -17,17 +17,7 @@ import torch
 from fragprune_plugins.constants import VERSION
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.reading import MEBIBYTE, Reading, parse_json
-from fragprune_plugins.workbench.models.formats import Format
-from fragprune_plugins.workbench.models.formats.values import (
-    SH_C0,
-    array,
-    byte,
-    opacities_of,
-    quaternions_of,
-    rules_of,
-    splat_of,
-    turned,
-)
+from fragprune_plugins.workbench.models.formats import Format, arrays
 
 BASE = "KHR_gaussian_splatting"
 CUTOFF = "FRAGPRUNE_gaussian_splatting_cutoff"
@@ -80,7 +70,7 @@ def read(reading: Reading) -> Model:
     rotation, scale, opacity, base, *rest = parts
     if (scale < 0).any():
         raise ValueError("negative scales")
-    splat = splat_of(
+    splat = arrays.splat_of(
         xyz=xyz,
         colours=base,
         rest=np.stack(rest, axis=1) if rest else np.zeros((len(xyz), 0, 3)),
@@ -91,7 +81,7 @@ def read(reading: Reading) -> Model:
         stop=None if extension is None else extension.get("stop"),
         rim="hard" if extension is None else extension.get("rim", "hard"),
     )
-    return turned(splat, _AXES)
+    return arrays.turned(splat, _AXES)
 
 
 def _primitive(scene: dict[str, Any]) -> dict[str, Any]:
@@ -141,15 +131,19 @@ def _accessor(
 
 def write(file: BinaryIO, splat: Model) -> None:
     """Write one primitive; the extension is there only with thresholds or a stop."""
-    splat = turned(splat, _AXES)
-    xyz, base, rest = array(splat.xyz), array(splat.f_dc)[:, 0], array(splat.f_rest)
-    opacity = opacities_of(splat)
-    rgba = byte(255 * np.column_stack([np.clip(0.5 + SH_C0 * base, 0, 1), opacity]))
+    splat = arrays.turned(splat, _AXES)
+    xyz, base, rest = (
+        arrays.array(splat.xyz),
+        arrays.array(splat.f_dc)[:, 0],
+        arrays.array(splat.f_rest),
+    )
+    opacity = arrays.opacities_of(splat)
+    rgba = arrays.byte(255 * np.column_stack([np.clip(0.5 + arrays.SH_C0 * base, 0, 1), opacity]))
     columns = {
         "POSITION": xyz,
         "COLOR_0": rgba,
-        f"{BASE}:ROTATION": quaternions_of(splat)[:, [1, 2, 3, 0]],
-        f"{BASE}:SCALE": np.exp(array(splat.scaling)),
+        f"{BASE}:ROTATION": arrays.quaternions_of(splat)[:, [1, 2, 3, 0]],
+        f"{BASE}:SCALE": np.exp(arrays.array(splat.scaling)),
         f"{BASE}:OPACITY": opacity[:, None],
         **dict(zip(_SH, [base, *rest.transpose(1, 0, 2)], strict=False)),
     }
@@ -161,29 +155,25 @@ def write(file: BinaryIO, splat: Model) -> None:
     }
     used = [BASE]
     if (falloff := splat.falloff) is not None:
-        columns[_THRESHOLD] = array(falloff)[:, None]
+        columns[_THRESHOLD] = arrays.array(falloff)[:, None]
     if splat.pruned:
-        extension["extensions"] = {CUTOFF: rules_of(splat)}
+        extension["extensions"] = {CUTOFF: arrays.rules_of(splat)}
         used.append(CUTOFF)
     views: list[dict[str, Any]] = []
     accessors: list[dict[str, Any]] = []
     at = 0
+    kinds = {width: name for name, width in _WIDTHS.items()}
     for values in columns.values():
-        views.append(
-            {"buffer": 0, "byteOffset": at, "byteLength": values.nbytes, "target": _ARRAY_BUFFER}
-        )
-        accessors.append(
-            {
-                "bufferView": len(accessors),
-                "componentType": _UBYTE if values.dtype == np.uint8 else _FLOAT,
-                "count": len(values),
-                "type": {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[values.shape[1]],
-            }
-        )
+        place = {"buffer": 0, "byteOffset": at, "byteLength": values.nbytes}
+        views.append(place | {"target": _ARRAY_BUFFER})
+        kind = _UBYTE if values.dtype == np.uint8 else _FLOAT
+        rows = {"count": len(values), "type": kinds[values.shape[1]]}
+        accessors.append({"bufferView": len(accessors), "componentType": kind, **rows})
         at += values.nbytes
     accessors[0] |= {"min": xyz.min(axis=0).tolist(), "max": xyz.max(axis=0).tolist()}
     accessors[1]["normalized"] = True
     attributes = {name: index for index, name in enumerate(columns)}
+    primitive = {"attributes": attributes, "mode": _POINTS, "extensions": {BASE: extension}}
     scene = {
         "asset": {"version": "2.0", "generator": f"fragprune {VERSION}"},
         "extensionsUsed": used,
@@ -193,13 +183,7 @@ def write(file: BinaryIO, splat: Model) -> None:
         "buffers": [{"byteLength": at}],
         "bufferViews": views,
         "accessors": accessors,
-        "meshes": [
-            {
-                "primitives": [
-                    {"attributes": attributes, "mode": _POINTS, "extensions": {BASE: extension}}
-                ]
-            }
-        ],
+        "meshes": [{"primitives": [primitive]}],
     }
     head = json.dumps(scene, separators=(",", ":")).encode()
     head += b" " * (-len(head) % 4)

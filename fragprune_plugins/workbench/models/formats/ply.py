@@ -9,18 +9,9 @@ import torch
 from plyfile import PlyData, PlyElement
 from torch import Tensor
 
+from fragprune_plugins.files import ply
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.files.ply import (
-    DC,
-    FILTER,
-    RIM,
-    ROTATION,
-    SCALES,
-    STOP,
-    THRESHOLD_COLUMN,
-    XYZ,
-)
 
 
 def write_ply(path: Path, model: Model) -> None:
@@ -37,26 +28,26 @@ def write_ply(path: Path, model: Model) -> None:
     n = len(model)
     rest = model.f_rest.transpose(1, 2).reshape(n, -1)
     columns: list[tuple[tuple[str, ...], Tensor]] = [
-        (XYZ, model.xyz),
+        (ply.XYZ, model.xyz),
         (("nx", "ny", "nz"), torch.zeros(n, 3)),
-        (DC, model.f_dc[:, 0]),
+        (ply.DC, model.f_dc[:, 0]),
         (tuple(f"f_rest_{i}" for i in range(rest.shape[1])), rest),
         (("opacity",), model.opacity),
-        (SCALES[: model.scaling.shape[1]], model.scaling),
-        (ROTATION, model.rotation),
+        (ply.SCALES[: model.scaling.shape[1]], model.scaling),
+        (ply.ROTATION, model.rotation),
     ]
     if model.filter_3d is not None:
-        columns.append(((FILTER,), model.filter_3d))
+        columns.append(((ply.FILTER,), model.filter_3d))
     if (falloff := model.falloff) is not None:
-        columns.append(((THRESHOLD_COLUMN,), falloff.reshape(n, 1)))
+        columns.append(((ply.THRESHOLD_COLUMN,), falloff.reshape(n, 1)))
     names = [name for group, _ in columns for name in group]
     table = torch.cat([values.detach().cpu().float() for _, values in columns], dim=1)
     rows = np.ascontiguousarray(table.numpy()).view([(name, "<f4") for name in names])[:, 0]
     # An element's comments come after its line: some viewers read the number of Gaussians off the
     # header's third line, whatever it says.
-    comments = [] if model.stop is None else [f"{STOP} {model.stop!r}"]
+    comments = [] if model.stop is None else [f"{ply.STOP} {model.stop!r}"]
     if model.rim != "hard":
-        comments.append(f"{RIM} {model.rim}")
+        comments.append(f"{ply.RIM} {model.rim}")
     vertices = PlyElement.describe(rows, "vertex", comments=comments)
     with replacing(path) as temporary:
         PlyData([vertices], byte_order="<").write(str(temporary))

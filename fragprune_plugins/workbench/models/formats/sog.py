@@ -23,25 +23,8 @@ from fragprune_plugins.constants import VERSION
 from fragprune_plugins.errors import ModelFileError
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.reading import MEBIBYTE, Door, Reading, parse_json
-from fragprune_plugins.workbench.models.formats import Format
+from fragprune_plugins.workbench.models.formats import Format, arrays
 from fragprune_plugins.workbench.models.formats.palette import codebook, nearest, palette
-from fragprune_plugins.workbench.models.formats.values import (
-    Bytes,
-    array,
-    byte,
-    codes_of,
-    expect_plausible,
-    log,
-    morton_order,
-    of_codes,
-    opacities_of,
-    quaternions_of,
-    rules_of,
-    splat_of,
-    take,
-    with_largest,
-    without_largest,
-)
 
 EXTRA = "fragprune_cutoff"
 """Key in ``extras``; its ``files`` names one image, whose red channel holds a code a texel."""
@@ -70,7 +53,7 @@ def read(reading: Reading) -> Model:
             if info.file_size > reading.size + _META_MAX:  # WebP gets no smaller in a zip
                 raise ValueError(f"{info.file_size} bytes in {name}")
             with archive.open(info) as member:
-                return take(member, info.file_size)
+                return arrays.take(member, info.file_size)
 
         _bounded(archive.getinfo(_META).file_size)
         return _read(parse_json(load(_META).decode()), load)
@@ -100,11 +83,11 @@ def _read(meta: dict[str, Any], load: Load) -> Model:
     count = meta["count"]
     if not isinstance(count, int):
         raise ValueError(f"{count!r} Gaussians")
-    expect_plausible(count, len(load(meta["means"]["files"][0])))
+    arrays.expect_plausible(count, len(load(meta["means"]["files"][0])))
     if (kind := meta.get("model", "default")) != "default":
-        log.warning("SOG: its training model is %.40r, and is drawn as 3DGS draws", kind)
+        arrays.log.warning("SOG: its training model is %.40r, and is drawn as 3DGS draws", kind)
 
-    def image(part: dict[str, Any], index: int = 0) -> Bytes:
+    def image(part: dict[str, Any], index: int = 0) -> arrays.Bytes:
         return _pixels(load(part["files"][index]), count).reshape(-1, 4)[:count]
 
     means, scales, base = meta["means"], meta["scales"], meta["sh0"]
@@ -115,22 +98,21 @@ def _read(meta: dict[str, Any], load: Load) -> Model:
         xyz = np.sign(logs) * np.expm1(np.abs(logs))
     rgba = image(base)
     extra = meta.get("extras", {}).get(EXTRA, {})
-    return splat_of(
+    return arrays.splat_of(
         xyz=xyz,
         colours=_book(base)[rgba[:, :3]],
         rest=_rest(meta.get("shN"), load, image, count),
         opacities=rgba[:, 3] / 255,
         log_scales=_book(scales)[image(scales)[:, :3]],
         rotations=_rotations(image(meta["quats"])),
-        thresholds=of_codes(image(extra)[:, 0]) if "files" in extra else None,
+        thresholds=arrays.of_codes(image(extra)[:, 0]) if "files" in extra else None,
         stop=extra.get("stop"),
         rim=extra.get("rim", "hard"),
     )
 
 
-def _pixels(data: bytes, count: int) -> Bytes:
+def _pixels(data: bytes, count: int) -> arrays.Bytes:
     """The pixels of a WebP (height, width, 4), which has to have a texel for each Gaussian."""
-
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the count decides
         with Image.open(io.BytesIO(data), formats=["WEBP"]) as picture:
@@ -147,7 +129,7 @@ def _book(part: dict[str, Any]) -> npt.NDArray[np.float32]:
 
 
 def _rest(
-    part: dict[str, Any] | None, load: Load, image: Callable[..., Bytes], count: int
+    part: dict[str, Any] | None, load: Load, image: Callable[..., arrays.Bytes], count: int
 ) -> npt.NDArray[Any]:
     """The SH of degrees 1 and more (N, K - 1, 3): labels, palette, codebook."""
     if part is None:
@@ -167,17 +149,17 @@ def _rest(
     return rest
 
 
-def _rotations(texels: Bytes) -> npt.NDArray[Any]:
+def _rotations(texels: arrays.Bytes) -> npt.NDArray[Any]:
     """Quaternions w, x, y, z: three components of 8 bits, and which one is the largest."""
     largest = texels[:, 3].astype(np.int64) - 252
     if (largest < 0).any():
         raise ValueError("rotations without a largest component")
-    return with_largest(largest, (texels[:, :3] / 255 * 2 - 1) / _SQRT2)
+    return arrays.with_largest(largest, (texels[:, :3] / 255 * 2 - 1) / _SQRT2)
 
 
 def write(file: BinaryIO, splat: Model) -> None:
     """Write a bundle along a Z-order curve; the extra image is there only if it cuts something."""
-    order, codes, extra = morton_order(splat), codes_of(splat), rules_of(splat)
+    order, codes, extra = arrays.morton_order(splat), arrays.codes_of(splat), arrays.rules_of(splat)
     splat = splat.untruncated().keep(order)
     count = len(splat)
     width = 4 * math.ceil(count**0.5 / 4)
@@ -194,15 +176,15 @@ def write(file: BinaryIO, splat: Model) -> None:
         files[name] = _webp(texels.reshape(height, width, 4))
         return [name]
 
-    xyz = array(splat.xyz).astype(np.float64)
+    xyz = arrays.array(splat.xyz).astype(np.float64)
     logs = np.sign(xyz) * np.log1p(np.abs(xyz))
     low, high = logs.min(axis=0), logs.max(axis=0)
     steps = np.floor(65535 * (logs - low) / np.where(high > low, high - low, 1) + 0.5)
     fine, coarse = (steps.astype(np.uint16) >> shift & 0xFF for shift in (0, 8))
-    scales, base = array(splat.scaling), array(splat.f_dc)[:, 0]
+    scales, base = arrays.array(splat.scaling), arrays.array(splat.f_dc)[:, 0]
     books = [codebook(values) for values in (scales, base)]
     rgb = nearest(books[1], base)
-    rgba = np.concatenate([rgb, byte(255 * opacities_of(splat))[:, None]], axis=1)
+    rgba = np.concatenate([rgb, arrays.byte(255 * arrays.opacities_of(splat))[:, None]], axis=1)
     meta: dict[str, Any] = {
         "version": 2,
         "asset": {"generator": f"fragprune v{VERSION}"},
@@ -216,11 +198,11 @@ def write(file: BinaryIO, splat: Model) -> None:
             "codebook": books[0].tolist(),
             "files": plane("scales.webp", nearest(books[0], scales)),
         },
-        "quats": {"files": plane("quats.webp", _packed_rotations(quaternions_of(splat)))},
+        "quats": {"files": plane("quats.webp", _packed_rotations(arrays.quaternions_of(splat)))},
         "sh0": {"codebook": books[1].tolist(), "files": plane("sh0.webp", rgba)},
     }
     if splat.sh_degree:
-        rest = array(splat.f_rest)
+        rest = arrays.array(splat.f_rest)
         entries, labels = palette(rest.reshape(count, -1))
         book, wide = codebook(entries), rest.shape[1]
         tall = -(-len(entries) // _PALETTE)
@@ -245,14 +227,13 @@ def write(file: BinaryIO, splat: Model) -> None:
             archive.writestr(zipfile.ZipInfo(name), content)  # of 1980: the same bytes every time
 
 
-def _packed_rotations(quaternions: npt.NDArray[Any]) -> Bytes:
-    largest, three = without_largest(quaternions)
-    packed = byte(255 * (three * _SQRT2 * 0.5 + 0.5))
+def _packed_rotations(quaternions: npt.NDArray[Any]) -> arrays.Bytes:
+    largest, three = arrays.without_largest(quaternions)
+    packed = arrays.byte(255 * (three * _SQRT2 * 0.5 + 0.5))
     return np.concatenate([packed, (252 + largest).astype(np.uint8)[:, None]], axis=1)
 
 
-def _webp(pixels: Bytes) -> bytes:
-
+def _webp(pixels: arrays.Bytes) -> bytes:
     out = io.BytesIO()
     # exact: also the colours of texels whose opacity is 0
     Image.fromarray(pixels).save(out, "WEBP", lossless=True, exact=True)

@@ -12,15 +12,7 @@ import numpy as np
 
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.reading import Reading
-from fragprune_plugins.workbench.models.formats import Format
-from fragprune_plugins.workbench.models.formats.values import (
-    SH_C0,
-    array,
-    byte,
-    opacities_of,
-    quaternions_of,
-    splat_of,
-)
+from fragprune_plugins.workbench.models.formats import Format, arrays
 
 _ROW = np.dtype([("xyz", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rot", "u1", 4)])
 _SCALE_MIN = 1e-30  # some writers leave 0, which has no logarithm
@@ -34,9 +26,9 @@ def read(reading: Reading) -> Model:
     if (data["scale"] < 0).any():
         raise ValueError("negative standard deviations")
     rgba = data["rgba"] / np.float32(255)
-    return splat_of(
+    return arrays.splat_of(
         xyz=data["xyz"],
-        colours=(rgba[:, :3] - 0.5) / SH_C0,
+        colours=(rgba[:, :3] - 0.5) / arrays.SH_C0,
         rest=np.zeros((len(data), 0, 3)),
         opacities=rgba[:, 3],
         log_scales=np.log(np.maximum(data["scale"], _SCALE_MIN)),
@@ -47,11 +39,11 @@ def read(reading: Reading) -> Model:
 def write(file: BinaryIO, splat: Model) -> None:
     """Write the Gaussians; the registry has refused thresholds."""
     data = np.zeros(len(splat), _ROW)
-    data["xyz"] = array(splat.xyz)
-    data["scale"] = np.exp(array(splat.scaling))
-    data["rgba"][:, :3] = byte(255 * (0.5 + SH_C0 * array(splat.f_dc)[:, 0]))
-    data["rgba"][:, 3] = byte(255 * opacities_of(splat))
-    data["rot"] = byte(128 + 128 * quaternions_of(splat))
+    data["xyz"] = arrays.array(splat.xyz)
+    data["scale"] = np.exp(arrays.array(splat.scaling))
+    data["rgba"][:, :3] = arrays.byte(255 * (0.5 + arrays.SH_C0 * arrays.array(splat.f_dc)[:, 0]))
+    data["rgba"][:, 3] = arrays.byte(255 * arrays.opacities_of(splat))
+    data["rot"] = arrays.byte(128 + 128 * arrays.quaternions_of(splat))
     file.write(data.tobytes())
 
 

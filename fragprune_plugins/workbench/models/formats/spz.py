@@ -19,23 +19,7 @@ import numpy.typing as npt
 
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.reading import Reading
-from fragprune_plugins.workbench.models.formats import Format
-from fragprune_plugins.workbench.models.formats.values import (
-    Bytes,
-    array,
-    byte,
-    codes_of,
-    expect_plausible,
-    log,
-    of_codes,
-    opacities_of,
-    quaternions_of,
-    rows,
-    splat_of,
-    take,
-    turned,
-    with_largest,
-)
+from fragprune_plugins.workbench.models.formats import Format, arrays
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -73,10 +57,10 @@ def read(reading: Reading) -> Model:
     reading.file.seek(0)
     if magic[:2] == b"\x1f\x8b":
         with gzip.GzipFile(fileobj=reading.file) as stream:
-            header = _Header(take(stream, 16), reading.size)
+            header = _Header(arrays.take(stream, 16), reading.size)
             if header.version not in (2, 3):
                 raise ValueError(f"version {header.version} of SPZ in gzip")
-            parts = [take(stream, size) for size in header.sizes]
+            parts = [arrays.take(stream, size) for size in header.sizes]
             records = _records(stream.read(header.count + 4096)) if header.extended else {}
     else:
         header = _Header(reading.take(16), reading.size)
@@ -90,13 +74,15 @@ def read(reading: Reading) -> Model:
         records = _records(zone) if header.extended else {}
         parts = _streams(reading, header)
     if header.antialiased:
-        log.warning("SPZ: it was trained with antialiasing, and is drawn as 3DGS draws, without")
+        arrays.log.warning(
+            "SPZ: it was trained with antialiasing, and is drawn as 3DGS draws, without"
+        )
     if unknown := records.keys() - {CUTOFFS, STOP, SOFT, _COORDINATES}:
         named = ", ".join(f"{each:#010x}" for each in sorted(unknown)[:_NAMED])
-        log.warning("SPZ: skipped %d extension(s): %s", len(unknown), named)
+        arrays.log.warning("SPZ: skipped %d extension(s): %s", len(unknown), named)
     splat = _splat(header, parts, records.get(CUTOFFS), records.get(STOP))
     splat = splat.with_rules(rim="soft") if SOFT in records else splat
-    return turned(splat, _axes(records.get(_COORDINATES)))
+    return arrays.turned(splat, _axes(records.get(_COORDINATES)))
 
 
 class _Header:
@@ -114,7 +100,7 @@ class _Header:
         self.extended, self.antialiased = bool(flags & _EXTENDED), bool(flags & _ANTIALIASED)
         widths = (9, 1, 3, 3, 3 if self.version == 2 else 4, 3 * _COEFFICIENTS[degree])
         self.sizes = [self.count * width for width in widths]
-        expect_plausible(self.count, size)
+        arrays.expect_plausible(self.count, size)
 
 
 def _streams(reading: Reading, header: _Header) -> list[bytes]:
@@ -128,7 +114,7 @@ def _streams(reading: Reading, header: _Header) -> list[bytes]:
         if size != expected:
             raise ValueError(f"a stream of {size} bytes, where {expected} belong")
         with zstd.ZstdFile(io.BytesIO(reading.take(compressed))) as stream:
-            parts.append(take(stream, size))
+            parts.append(arrays.take(stream, size))
     return parts + [b""] * (len(header.sizes) - len(parts))
 
 
@@ -164,40 +150,42 @@ def _splat(header: _Header, parts: list[bytes], codes: bytes | None, stop: bytes
     count = header.count
     if codes is not None and len(codes) != count:
         raise ValueError(f"{len(codes)} thresholds for {count} Gaussians")
-    positions, alphas, colours, scales, rotations, sh = (rows(part, count) for part in parts)
+    positions, alphas, colours, scales, rotations, sh = (
+        np.frombuffer(part, np.uint8).reshape(count, -1) for part in parts
+    )
     b = positions.reshape(count, 3, 3).astype(np.int32)
     fixed = b[..., 0] | b[..., 1] << 8 | b[..., 2] << 16
     fixed -= (fixed & 0x800000) << 1
-    return splat_of(
+    return arrays.splat_of(
         xyz=fixed / np.float32(1 << header.bits),
         colours=(colours / 255 - 0.5) / _COLOUR_SCALE,
         rest=((sh.astype(np.float32) - 128) / 128).reshape(count, -1, 3),
         opacities=alphas[:, 0] / 255,
         log_scales=scales / 16 - 10,
         rotations=_first_three(rotations) if header.version == 2 else _smallest_three(rotations),
-        thresholds=None if codes is None else of_codes(np.frombuffer(codes, np.uint8)),
+        thresholds=None if codes is None else arrays.of_codes(np.frombuffer(codes, np.uint8)),
         stop=None if stop is None else float(f"{struct.unpack('<f', stop)[0]:.6g}"),  # as written
     )
 
 
-def _first_three(data: Bytes) -> npt.NDArray[Any]:
+def _first_three(data: arrays.Bytes) -> npt.NDArray[Any]:
     """Quaternions w, x, y, z of version 2: x, y, z in 8 bits, w >= 0."""
     xyz = data / 127.5 - 1
     return np.column_stack([np.sqrt(np.maximum(0, 1 - (xyz**2).sum(axis=1))), xyz])
 
 
-def _smallest_three(data: Bytes) -> npt.NDArray[Any]:
+def _smallest_three(data: arrays.Bytes) -> npt.NDArray[Any]:
     """Quaternions w, x, y, z of versions 3 and 4: index of the largest, and 9 bits and a sign."""
     packed = np.ascontiguousarray(data).view("<u4")[:, 0]
     largest = packed >> 30
     fields = np.stack([packed >> 20, packed >> 10, packed], axis=1) & 0x3FF
     three = _SQRT_HALF * (fields & 0x1FF) / 511 * np.where(fields & 0x200, -1, 1)
-    return with_largest(largest, three)[:, [3, 0, 1, 2]]
+    return arrays.with_largest(largest, three)[:, [3, 0, 1, 2]]
 
 
 def write(file: BinaryIO, splat: Model) -> None:
     """Write version 4; extension records are there only for thresholds that cut, and for rules."""
-    xyz, sh, bits = array(splat.xyz), array(splat.f_rest), _FRACTION_BITS
+    xyz, sh, bits = arrays.array(splat.xyz), arrays.array(splat.f_rest), _FRACTION_BITS
     while bits and np.abs(xyz).max() * (1 << bits) >= (1 << 23) - 1:
         bits -= 1  # a scene wider than 2048 units
     fixed = _rounded(xyz * np.float32(1 << bits))
@@ -208,14 +196,16 @@ def write(file: BinaryIO, splat: Model) -> None:
     quantised = (_rounded(sh * 128).astype(np.int32) + 128 + levels // 2) // levels * levels
     parts = [
         packed,
-        byte(opacities_of(splat) * 255),
-        byte(array(splat.f_dc)[:, 0] * np.float32(_COLOUR_SCALE * 255) + np.float32(127.5)),
-        byte((array(splat.scaling) + 10) * 16),
-        _packed_rotations(quaternions_of(splat)),
+        arrays.byte(arrays.opacities_of(splat) * 255),
+        arrays.byte(
+            arrays.array(splat.f_dc)[:, 0] * np.float32(_COLOUR_SCALE * 255) + np.float32(127.5)
+        ),
+        arrays.byte((arrays.array(splat.scaling) + 10) * 16),
+        _packed_rotations(arrays.quaternions_of(splat)),
         np.clip(quantised, 0, 255).astype(np.uint8),
     ]
     streams = [np.ascontiguousarray(part).tobytes() for part in parts if part.size]
-    codes = codes_of(splat)
+    codes = arrays.codes_of(splat)
     zone = b"" if codes is None else _RECORD.pack(CUTOFFS, len(codes)) + codes.tobytes()
     if splat.stop is not None:
         zone += _RECORD.pack(STOP, 4) + struct.pack("<f", splat.stop)

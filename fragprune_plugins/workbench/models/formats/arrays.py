@@ -203,8 +203,3 @@ def expect_plausible(count: int, size: int) -> None:
     """Raise ValueError if so many bytes cannot hold the positions of so many Gaussians."""
     if not 0 < count <= size * PER_BYTE:
         raise ValueError(f"{count} Gaussians in {size} bytes")
-
-
-def rows(data: bytes, count: int, kind: str = "u1") -> npt.NDArray[Any]:
-    """Bytes as (count, width) numbers."""
-    return np.frombuffer(data, kind).reshape(count, -1)
