@@ -611,13 +611,24 @@ def _reached(fork: Fork, node: ast.AST) -> Iterator[str]:
         if isinstance(node, ast.If) and each in node.body and _needs_option(fork, node.test):
             drawn = graphdeco.drawing_functions(fork.repo, RENDERER)
             if not _mentioned(each).isdisjoint(drawn):
-                fork.options |= {node.test.attr}  # type: ignore[attr-defined]
+                tests = [n.attr for n in nodes(node.test) if isinstance(n, ast.Attribute)]
+                fork.options |= {name for name in tests if fork.is_off(name)}
             continue
         yield from _reached(fork, each)
 
 
 def _needs_option(fork: Fork, test: ast.expr) -> bool:
+    if isinstance(test, ast.BoolOp) and isinstance(test.op, ast.And):
+        return any(_needs_option(fork, each) for each in test.values)
     return isinstance(test, ast.Attribute) and fork.is_off(test.attr)
+
+
+def _by_default(fork: Fork, node: ast.AST) -> Iterator[ast.AST]:
+    """A script without what it does under an option that is off by default."""
+    yield node
+    for each in ast.iter_child_nodes(node):
+        if not (isinstance(node, ast.If) and each in node.body and _needs_option(fork, node.test)):
+            yield from _by_default(fork, each)
 
 
 def _check_call(fork: Fork, at: str, function: str, call: graphdeco.CallInSource) -> None:
@@ -755,7 +766,7 @@ def _uses(fork: Fork, draw: Draw, name: str) -> list[str]:
             for inner in ast.walk(node)
         }
         passed |= _only_named(tree)
-        for node in ast.walk(tree):
+        for node in _by_default(fork, tree):
             read = isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Load)
             index = node.slice if read else None  # type: ignore[attr-defined]
             if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "get":

@@ -141,6 +141,21 @@ def test_a_value_that_is_only_handed_on_or_named_is_not_read(tmp_path):
     assert "touched, read in train.py" in found[0]
 
 
+def test_a_value_that_only_an_option_reads_is_not_read_without_it(tmp_path):
+    option = "\ndef read_flags", "\nparser.add_argument('--sparse'{})\n\ndef read_flags"
+    used = (
+        "        loss.backward()",
+        (
+            '        if opt.sparse and iteration > 100:\n            loss += package["touched"]\n'
+            "        loss.backward()"
+        ),
+    )
+    on, off = ((option[0], option[1].format(each)) for each in (", default=True", ""))
+    assert errors(fork(tmp_path / "off", off, used, values="image, radii, touched")) == []
+    found = errors(fork(tmp_path / "on", on, used, values="image, radii, touched"))
+    assert "touched, read in train.py" in found[0]
+
+
 def test_a_value_that_no_proof_can_tell_is_refused(tmp_path):
     used = (USED[0], USED[1].format("median_depth"))
     repo = fork(tmp_path, used, values="image, radii, median_depth")
