@@ -20,6 +20,7 @@ import fragprune_graphdeco as graphdeco
 from fragprune_3dgs_fork.fork import (
     CHECKPOINT,
     CLASS,
+    HANDED,
     MODEL,
     RENDERER,
     Fork,
@@ -80,7 +81,10 @@ class Unread:
             "fragprune finetune.",
         )
 
-    __getattr__ = __getitem__ = __len__ = __iter__ = __bool__ = __float__ = __array__ = _raise
+    def __getattr__(self, name: str) -> Any:
+        return (lambda *_: self) if name in HANDED else self._raise()
+
+    __getitem__ = __len__ = __iter__ = __bool__ = __float__ = __array__ = _raise
     __add__ = __radd__ = __sub__ = __rsub__ = __mul__ = __rmul__ = __truediv__ = _raise
     __rtruediv__ = __lt__ = __le__ = __gt__ = __ge__ = __neg__ = __pow__ = __matmul__ = _raise
 

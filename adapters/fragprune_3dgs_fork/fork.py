@@ -56,6 +56,8 @@ SERVED = {"dc"}
 _SCREEN = re.compile(r"means2D_\w+")
 """Further tensors that get a gradient on the screen, by which Gaussians are densified."""
 
+HANDED = ("detach", "clone", "contiguous", "squeeze", "unsqueeze")
+"""Methods of a value that nobody reads yet: it is handed on in another shape."""
 _PROVABLE = re.compile(r"^(?!.*(median|max|normal|var|dist)).*(depth|alpha|acc|opac)")
 """Names of values that a proof can tell, if they are what they are called."""
 
@@ -239,18 +241,13 @@ def _check_script(fork: Fork, script: str) -> None:
     if _PROCESSES.search(ast.unparse(tree)):
         found = "it trains in processes of its own"
         fork.refuse("script", script, found, "one process that keeps its files")
-    if (backward := sum(name == "backward" for _, name in _method_calls(tree))) > 1:
-        found = f"{backward} places that go backward, perhaps in one iteration"
-        fork.refuse("script", script, found, "one, by which steps are counted")
-    phases = [
-        node.name
-        for node in nodes(tree)
-        if isinstance(node, ast.FunctionDef)
-        and any(name == "backward" for _, name in _method_calls(node))
-        and len(fork.repo.calls(_module(script), node.name)) > 1
-    ]
-    if phases:
-        fork.refuse("script", script, f"several calls of {phases[0]}, which trains", "one training")
+    if several := _trainings(fork.repo, _module(script)):
+        fork.refuse("script", script, *several)
+    compared = [node for node in nodes(tree) if isinstance(node, ast.Compare)]
+    tests = [ast.unparse(each) for each in compared if isinstance(each.ops[0], ast.In)]
+    if not any(re.search(r" in (\w+\.)*sav\w*$", each) for each in tests):
+        found = "it does not save where --save_iterations says"
+        fork.refuse("script", script, found, "a model at these iterations")
     loops = [
         node
         for node in nodes(tree)
@@ -260,6 +257,43 @@ def _check_script(fork: Fork, script: str) -> None:
     if any(each in nodes(outer)[1:] for each in counted for outer in loops):
         fork.refuse("script", script, "a training in a loop", "one training")
     fork.one_run = fork.one_run or _not_resumed(fork.repo, script, tree)
+
+
+def _trainings(repo: HostRepo, module: str) -> tuple[str, str] | None:
+    """What goes backward more than once in one pass of a script, and what is expected.
+
+    Of two branches one is passed; what a function does counts where it is called.
+    """
+    body = getattr(repo.tree(module), "body", ())
+    functions = {each.name: each for each in body if isinstance(each, ast.FunctionDef)}
+    training, several = dict[str, int](), list[str]()
+
+    def passes(node: ast.AST, looped: bool = False) -> int:
+        if isinstance(node, ast.If):
+            return max(sum(passes(each, looped) for each in b) for b in (node.body, node.orelse))
+        own = 0
+        if isinstance(node, ast.Call):
+            called = getattr(node.func, "id", "")
+            again = looped and any(isinstance(n, ast.For) for n in nodes(functions.get(called)))
+            several.extend([called] * again * training.get(called, 0))
+            own = training.get(called, 0) * (1 + again)
+            own += getattr(node.func, "attr", "") == "backward"
+        looped |= isinstance(node, ast.For | ast.While)
+        return own + sum(passes(each, looped) for each in ast.iter_child_nodes(node))
+
+    while found := {k: 1 for k, each in functions.items() if k not in training and passes(each)}:
+        training |= found
+    main = [each for each in body if each not in functions.values()]
+    most = max(sum(map(passes, main)), *map(passes, functions.values()), 0)
+    if most < 2:
+        return None
+    several += [each for each in training if len(repo.calls(module, each)) > 1]
+    if several:
+        return f"several calls of {several[0]}, which trains", "one training"
+    return (
+        f"{most} places that go backward, perhaps in one iteration",
+        "one, by which steps are counted",
+    )
 
 
 def _not_resumed(repo: HostRepo, script: str, tree: ast.Module) -> str:
@@ -552,6 +586,11 @@ def _read_draws(fork: Fork) -> None:
             if any(re.search(r"torch\.(zeros|empty)\(", ast.unparse(each)) for each in made):
                 found = f"{ast.unparse(blended or ast.Pass())}, which is empty unless asked for"
                 fork.refuse("rasterizer-call", at, found, "channels of every Gaussian")
+        for node in nodes(body):
+            if isinstance(node, ast.Call) and "means3D" in plain.arguments(node):
+                other = plain.Drawing(fork.repo, RENDERER, body, call=node)
+                for found in (why for why, moves in other.shapes() if not moves):
+                    fork.refuse("rasterizer-call", at, found, "the model's own Gaussians")
         for cut in [*source.cuts()][:1]:
             found = f"a picture of more channels, {ast.unparse(cut)}"
             fork.refuse("rasterizer-call", at, found, "a picture")
@@ -572,13 +611,24 @@ def _reached(fork: Fork, node: ast.AST) -> Iterator[str]:
         if isinstance(node, ast.If) and each in node.body and _needs_option(fork, node.test):
             drawn = graphdeco.drawing_functions(fork.repo, RENDERER)
             if not _mentioned(each).isdisjoint(drawn):
-                fork.options |= {node.test.attr}  # type: ignore[attr-defined]
+                tests = [n.attr for n in nodes(node.test) if isinstance(n, ast.Attribute)]
+                fork.options |= {name for name in tests if fork.is_off(name)}
             continue
         yield from _reached(fork, each)
 
 
 def _needs_option(fork: Fork, test: ast.expr) -> bool:
+    if isinstance(test, ast.BoolOp) and isinstance(test.op, ast.And):
+        return any(_needs_option(fork, each) for each in test.values)
     return isinstance(test, ast.Attribute) and fork.is_off(test.attr)
+
+
+def _by_default(fork: Fork, node: ast.AST) -> Iterator[ast.AST]:
+    """A script without what it does under an option that is off by default."""
+    yield node
+    for each in ast.iter_child_nodes(node):
+        if not (isinstance(node, ast.If) and each in node.body and _needs_option(fork, node.test)):
+            yield from _by_default(fork, each)
 
 
 def _check_call(fork: Fork, at: str, function: str, call: graphdeco.CallInSource) -> None:
@@ -689,16 +739,17 @@ def _uses(fork: Fork, draw: Draw, name: str) -> list[str]:
     keys: set[str] = set()
     handed: set[int] = set()
     for node in ast.walk(body):
+        pairs: list[tuple[ast.expr | None, ast.expr]] = []
         if isinstance(node, ast.Dict):
-            for key, value in zip(node.keys, node.values, strict=True):
-                if isinstance(key, ast.Constant) and getattr(value, "id", "") == name:
-                    keys.add(str(key.value))
-                    handed.add(id(value))
-        elif isinstance(node, ast.Assign) and getattr(node.value, "id", "") == name:
-            target = node.targets[0]
-            if isinstance(target, ast.Subscript) and isinstance(target.slice, ast.Constant):
-                keys.add(str(target.slice.value))
-                handed.add(id(node.value))
+            pairs = list(zip(node.keys, node.values, strict=True))
+        elif isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Subscript):
+            pairs = [(node.targets[0].slice, node.value)]
+        for key, value in pairs:
+            while isinstance(value, ast.Call) and getattr(value.func, "attr", "") in HANDED:
+                value = value.func.value  # type: ignore[attr-defined]
+            if isinstance(key, ast.Constant) and getattr(value, "id", "") == name:
+                keys.add(str(key.value))
+                handed.add(id(value))
     places = [
         fork.repo.at(RENDERER, node.lineno)
         for node in ast.walk(body)
@@ -714,7 +765,8 @@ def _uses(fork: Fork, draw: Draw, name: str) -> list[str]:
             if method in fork.still
             for inner in ast.walk(node)
         }
-        for node in ast.walk(tree):
+        passed |= _only_named(tree)
+        for node in _by_default(fork, tree):
             read = isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Load)
             index = node.slice if read else None  # type: ignore[attr-defined]
             if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "get":
@@ -722,3 +774,19 @@ def _uses(fork: Fork, draw: Draw, name: str) -> list[str]:
             if getattr(index, "value", None) in keys and keys and id(node) not in passed:
                 places.append(fork.repo.at(module, node.lineno))  # type: ignore[attr-defined]
     return places
+
+
+def _only_named(tree: ast.AST) -> set[int]:
+    """Values that a script gives a name, and never reads by it."""
+    read = {
+        node.id
+        for node in nodes(tree)
+        if isinstance(node, ast.Name) and not isinstance(node.ctx, ast.Store)
+    }
+    named = set[int]()
+    for node in (each for each in nodes(tree) if isinstance(each, ast.Assign)):
+        target, value = node.targets[0], node.value
+        several = isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple)
+        pairs = zip(target.elts, value.elts, strict=False) if several else [(target, value)]  # type: ignore[attr-defined]
+        named |= {id(v) for t, v in pairs if isinstance(t, ast.Name) and t.id not in read}
+    return named

@@ -43,6 +43,8 @@ _OF_CALL = re.compile(
 """Parameters of a drawing function that move or select Gaussians, or are their values."""
 _KEEPS = ("clamp", "clamp_", "contiguous", "squeeze", "unsqueeze", "to", "permute")
 """Methods that keep the numbers of a picture."""
+_ADDED = re.compile(r"bg_color|zeros_like\(\w+\)$|\* 0\.0$")
+"""What is added to a picture and leaves its Gaussians alone: a background, or zeros."""
 _PICTURES = re.compile(r"mesh_\w+|\w+_(rgb|colou?rs?)")
 """Arguments of a rasterizer that are pictures to blend with its own."""
 _GSPLAT = {
@@ -399,7 +401,7 @@ def _call(function: ast.AST, off: Collection[str] = ()) -> ast.Call | None:
     calls = [
         node
         for node in nodes(function)
-        if isinstance(node, ast.Call) and "means3D" in _arguments(node)
+        if isinstance(node, ast.Call) and "means3D" in arguments(node)
     ]
     shown = _shown(function)
     return min(
@@ -407,7 +409,7 @@ def _call(function: ast.AST, off: Collection[str] = ()) -> ast.Call | None:
     )
 
 
-def _arguments(call: ast.AST | None) -> dict[str, ast.expr]:
+def arguments(call: ast.AST | None) -> dict[str, ast.expr]:
     """The arguments of a call, by their names in a rasterizer of 3DGS."""
     if not isinstance(call, ast.Call):
         return {}
@@ -436,15 +438,17 @@ def _shown(function: ast.AST) -> list[ast.AST]:
     for each in found:  # it grows
         if isinstance(each, ast.Name):
             found += made.pop(each.id, [])
-        elif "means3D" not in _arguments(each):
+        elif "means3D" not in arguments(each):
             found += ast.iter_child_nodes(each)
     return found
 
 
 def _needs(node: ast.If, off: Collection[str]) -> bool:
     """Whether a branch is taken only if one of these arguments is given."""
-    test = ast.unparse(node.test)
-    return any(re.fullmatch(rf"{each}( is not None)?", test) for each in off)
+    both = isinstance(node.test, ast.BoolOp) and isinstance(node.test.op, ast.And)
+    tests = map(ast.unparse, node.test.values if both else [node.test])  # type: ignore[attr-defined]
+    given = re.compile(rf"({'|'.join(sorted(off)) or '-'})( is not None)?")
+    return any(map(given.fullmatch, tests))
 
 
 class Drawing:
@@ -453,13 +457,19 @@ class Drawing:
     Args:
         drawn_from: attributes of the model, and arguments, that it may draw besides those of
             plain 3DGS.
+        call: the one that draws; by default that whose picture it returns.
 
     Attributes:
         colours: options, off by default, under which something else makes the colours.
     """
 
     def __init__(
-        self, repo: HostRepo, module: str, function: Function, drawn_from: Collection[str] = ()
+        self,
+        repo: HostRepo,
+        module: str,
+        function: Function,
+        drawn_from: Collection[str] = (),
+        call: ast.Call | None = None,
     ) -> None:
         self.repo, self.module, self.function = repo, module, function
         self.drawn_from = drawn_from
@@ -479,7 +489,7 @@ class Drawing:
             and isinstance(node.value, ast.Name)
         ]
         self.model = models[0] if models else "pc"
-        self.call = _call(function, self.off)
+        self.call = call or _call(function, self.off)
         self.colours = set[str]()
         named = (*self.parameters, self.model)
         self.made: dict[str, tuple[str, ...]] = {each: (each,) for each in named}
@@ -573,7 +583,7 @@ class Drawing:
     def selection(self) -> str:
         """The code that picks rows of what is drawn first, as ``means3D[mask]``; "" without any."""
         call, own, seen = self.call, f"{self.model}.get_xyz", set()
-        waiting = [value for name, value in _arguments(call).items() if name == "means3D"]
+        waiting = [value for name, value in arguments(call).items() if name == "means3D"]
         while waiting:
             for node in ast.walk(waiting.pop()):
                 if isinstance(node, ast.Name) and node.id not in seen:
@@ -594,7 +604,7 @@ class Drawing:
             yield f"its picture is cut out of a tensor with further channels ({cut})", False
         yield from self.inputs()
         calls = read_calls(self.repo, self.module, self.function.name)
-        names = dict.fromkeys([*_arguments(self.call), *(n for each in calls for n in each.given)])
+        names = dict.fromkeys([*arguments(self.call), *(n for each in calls for n in each.given)])
         if pictures := [each for each in names if _PICTURES.fullmatch(each)]:
             yield f"its rasterizer also takes {', '.join(pictures)}", False
         for made in filter(None, map(self._made_into, _pictures(self.function))):
@@ -610,10 +620,10 @@ class Drawing:
                 value = value.args[0]
                 continue
             if not isinstance(method, ast.Attribute) or method.attr not in _KEEPS:
-                return whole
+                return None if ast.unparse(method).startswith("bg_color.") else whole
             value = value.args[0] if ast.unparse(method.value) == "torch" else method.value
         if isinstance(value, ast.BinOp):
-            behind = isinstance(value.op, ast.Add) and "bg_color" in ast.unparse(value.right)
+            behind = isinstance(value.op, ast.Add) and _ADDED.search(ast.unparse(value.right))
             return self._made_into(value.left, seen) if behind else whole
         name = getattr(value, "id", "")
         others = self.values.get(name, []) if name not in seen else []
@@ -636,24 +646,31 @@ class Drawing:
         """Inputs of its call that a plain drawing does not have, and whether arguments of
         the function make them from the model's own.
         """
-        given = _arguments(self.call)
+        yield from self.shapes()
+        given = arguments(self.call)
         at = self.repo.at(self.module, self.function.lineno)
-        own = {"means3D": "get_xyz", "scales": "get_scaling", "rotations": "get_rotation"}
-        for argument in ("means3D", "opacities", "scales", "rotations", "shs"):
-            roots = list(self._roots(given[argument])) if argument in given else []
-            others = [each for each in dict.fromkeys(roots) if not self._plain(each)]
-            if others:
-                shown = ", ".join(others[:4])
-                what = f"makes {argument} from {shown}, not from its PLY alone"
-                if argument == "shs":
-                    what = f"makes colours from {shown}"
-                kept = f"{self.model}.{own.get(argument)}" in roots
-                yield f"{self.function.name} {what} ({at})", kept and self._beside(others)
+        roots = dict.fromkeys(self._roots(given["shs"])) if "shs" in given else {}
+        if others := [each for each in roots if not self._plain(each)]:
+            yield f"{self.function.name} makes colours from {', '.join(others[:4])} ({at})", False
         for name, usual in _USUAL.items():
             if name in given and getattr(given[name], "value", None) != usual:
                 how = f"{name}={ast.unparse(given[name])}, not {usual!r}"
                 yield f"{self.function.name} draws with {how} ({at})", False
         yield from self._of_colours(given)
+
+    def shapes(self) -> Iterator[tuple[str, bool]]:
+        """Likewise where its Gaussians are, and how large and opaque."""
+        given = arguments(self.call)
+        at = self.repo.at(self.module, self.function.lineno)
+        own = {"means3D": "get_xyz", "scales": "get_scaling", "rotations": "get_rotation"}
+        for argument in ("means3D", "opacities", "scales", "rotations"):
+            roots = list(self._roots(given[argument])) if argument in given else []
+            others = [each for each in dict.fromkeys(roots) if not self._plain(each)]
+            if others:
+                shown = ", ".join(others[:4])
+                what = f"makes {argument} from {shown}, not from its PLY alone"
+                kept = f"{self.model}.{own.get(argument)}" in roots
+                yield f"{self.function.name} {what} ({at})", kept and self._beside(others)
 
     def _of_colours(self, given: Mapping[str, ast.expr]) -> Iterator[tuple[str, bool]]:
         """Colours that are no spherical harmonics of the model's features."""
@@ -672,8 +689,9 @@ class Drawing:
 
     def _channels(self, value: ast.expr) -> Iterator[ast.expr]:
         """What the first channels are, where the picture is cut out of more."""
-        for each in self.values.get(getattr(value, "id", ""), [value]):
-            parts = each.args[:1] if isinstance(each, ast.Call) and any(self.cuts()) else []
+        made = self.values.get(getattr(value, "id", ""), [value]) if any(self.cuts()) else [value]
+        for each in made:
+            parts = each.args[:1] if isinstance(each, ast.Call) else []
             listed = parts and isinstance(parts[0], ast.Tuple | ast.List)
             yield parts[0].elts[0] if listed else each  # type: ignore[attr-defined]
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 from miniatures.forks import fork
 
-from fragprune_3dgs_fork import ForkAdapter
+from fragprune_3dgs_fork import ForkAdapter, Unread
 from fragprune_3dgs_fork.fork import read_fork
 from fragprune_plugins.adapting import EngineError, HostCall, NotComparedError, Role, UsageError
 from fragprune_plugins.hosts.choosing import attempt, choose
@@ -19,6 +19,7 @@ def errors(repo):
     return [str(each) for each in ForkAdapter().match(repo).findings if each.level == "error"]
 
 
+PACKAGE = "diff_gaussian_rasterization"
 DEPTH = "D += depths[collected_id[j]] * alpha * T; out_depth[pix_id] = D;"
 WEIGHT = "weight += alpha * T; out_alpha[pix_id] = weight;"
 INVERSE = "E += (1 / depths[collected_id[j]]) * alpha * T; out_invdepth[pix_id] = E;"
@@ -105,6 +106,54 @@ def test_gaussians_in_another_order_are_another_picture_of_a_plain_ply(tmp_path)
     plugins = load_plugins()
     verdict = judge(repo, attempt(repo, plugins.adapters), plugins.adapters, plugins)
     assert verdict.kind == "finetune"
+
+
+ONE_PASS = {
+    "branches": (
+        "        loss.backward()\n",
+        "        if opt.smooth:\n            (loss + more).backward()\n"
+        "        else:\n            loss.backward()\n",
+    ),
+    "another training instead": (
+        "\ndef read_flags",
+        "\ndef refine(opt):\n    loss.backward()\n\n"
+        "if opt.refined:\n    refine(opt)\nelse:\n    training(opt, 0)\n\ndef read_flags",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", ONE_PASS)
+def test_of_two_ways_back_one_is_taken(tmp_path, what):
+    assert errors(fork(tmp_path / "one", ONE_PASS[what])) == []
+    both = (ONE_PASS[what][0], ONE_PASS[what][1].replace("else:", "if opt.both:"))
+    assert "places that go backward" in errors(fork(tmp_path / "both", both))[0]
+
+
+def test_a_value_that_is_only_handed_on_or_named_is_not_read(tmp_path):
+    handed = ('"touched": touched', '"touched": touched.detach()')
+    named = ("        loss =", '        touched, more = package["touched"], 0\n        loss =')
+    repo = fork(tmp_path / "handed", handed, named, values="image, radii, touched")
+    assert errors(repo) == []
+    (value,) = (each.name for each in read_fork(repo).outputs[PACKAGE] if each.role == "unread")
+    assert Unread(value).detach().squeeze(0).unread
+    read = (named[0], named[1].replace("        loss =", "        print(touched)\n        loss ="))
+    found = errors(fork(tmp_path / "read", handed, read, values="image, radii, touched"))
+    assert "touched, read in train.py" in found[0]
+
+
+def test_a_value_that_only_an_option_reads_is_not_read_without_it(tmp_path):
+    option = "\ndef read_flags", "\nparser.add_argument('--sparse'{})\n\ndef read_flags"
+    used = (
+        "        loss.backward()",
+        (
+            '        if opt.sparse and iteration > 100:\n            loss += package["touched"]\n'
+            "        loss.backward()"
+        ),
+    )
+    on, off = ((option[0], option[1].format(each)) for each in (", default=True", ""))
+    assert errors(fork(tmp_path / "off", off, used, values="image, radii, touched")) == []
+    found = errors(fork(tmp_path / "on", on, used, values="image, radii, touched"))
+    assert "touched, read in train.py" in found[0]
 
 
 def test_a_value_that_no_proof_can_tell_is_refused(tmp_path):
@@ -543,6 +592,26 @@ REFUSED = {
         {},
         [("\ndef read_flags", "\ntraining(opt, 0)\ntraining(opt, 1)\n\ndef read_flags")],
         "several calls of training",
+    ),
+    "a training of each scene": (
+        {},
+        [("\ndef read_flags", "\nfor scan in scans:\n    training(opt, 0)\n\ndef read_flags")],
+        "several calls of training",
+    ),
+    "no model at the iterations asked for": (
+        {},
+        [("in save_iterations", "% 100 == 0")],
+        "does not save where --save_iterations says",
+    ),
+    "other Gaussians in a further draw": (
+        {},
+        [
+            (
+                '    return {"render"',
+                '    a, b = rasterizer(means3D=means3D, opacities=pc.net(1))\n    return {"render"',
+            )
+        ],
+        "makes opacities from pc.net",
     ),
     "processes": (
         {},

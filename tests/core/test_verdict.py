@@ -82,6 +82,20 @@ CLAMPED = """rotations=rotations
     return {"render": image.contiguous()}
 """
 
+EXPOSED = """rotations=rotations
+    )
+    if training and pc.exposure is not None:
+        image = image * pc.exposure
+    image = image + pc.net(t) * torch.zeros_like(image)
+    return {"render": image}
+"""
+CALL = "    image, radii, depth, used = rasterizer(\n"
+REUSED = f"""    seen = pc.get_features
+    colours = torch.clamp(seen, 0)
+    seen = pc.get_objects
+{CALL}        colors_precomp=colours,
+"""
+
 SHADOW = """    with torch.no_grad():
         _, shadow, _, _ = rasterizer(
             means3D=pc.get_xyz, opacities=pc.net(light), shs=None, colors_precomp=black
@@ -284,6 +298,8 @@ def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):
         ),
         ("rotations=rotations\n    )\n", "rotations=rotations\n    )\n    image = image[:3]\n"),
         ("rotations=rotations\n    )\n", CLAMPED),
+        (END, EXPOSED),
+        (CALL, REUSED),
         (
             "class GaussianModel:",
             f"class GaussianModel2D:{GROWS}(self): ...\n\n\nclass GaussianModel:",

@@ -111,6 +111,8 @@ def training(opt, checkpoint):
             gaussians.spread(grads)
             gaussians.thin_out(mask)
         gaussians.optimizer.step()
+        if iteration in save_iterations:
+            scene.save(iteration)
         torch.save((gaussians.capture(), iteration), f"{folder}/chkpnt{iteration}.pth")
 """
     + FLAGS
