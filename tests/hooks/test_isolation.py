@@ -1,6 +1,7 @@
 """A plugin that fails in a hook is named; what it answers is looked at before it is used."""
 
 import logging
+from inspect import signature
 from types import SimpleNamespace
 
 import pytest
@@ -42,30 +43,17 @@ ASK = {
 }
 """What makes the core ask."""
 
-OBSERVERS = [
-    "fragprune_attached",
-    "fragprune_population_changed",
-    "fragprune_step",
-    "fragprune_saved",
-    "fragprune_finished",
-]
+OBSERVERS = [name for name in vars(hookspecs) if name[:10] == "fragprune_" and name not in ASK]
 
 
 def plugin(hook, act):
     """A plugin that does something in one hook; every argument of the hook is taken."""
-    names = {
-        "fragprune_truncate": lambda inputs, store: act(),
-        "fragprune_create_engine": lambda name, device: act(),
-        "fragprune_create_schedule": lambda settings: act(),
-        "fragprune_select_adapter": lambda repo, matches: act(),
-        "fragprune_read_models": lambda repo: act(),
-        "fragprune_attached": lambda model, store: act(),
-        "fragprune_population_changed": lambda store, change: act(),
-        "fragprune_step": lambda stats: act(),
-        "fragprune_saved": lambda path: act(),
-        "fragprune_finished": lambda summary: act(),
-    }
-    return SimpleNamespace(**{hook: hookimpl(names[hook])})
+
+    def answer(*_):
+        return act()
+
+    answer.__signature__ = signature(getattr(hookspecs, hook))
+    return SimpleNamespace(**{hook: hookimpl(answer)})
 
 
 def raising(error):
@@ -79,11 +67,6 @@ def with_one(hook, act):
     plugins = Plugins()
     plugins.register(plugin(hook, act), "mine")
     return plugins
-
-
-def test_asked_and_told_are_all_hooks():
-    hooks = {name for name in vars(hookspecs) if name.startswith("fragprune_")}
-    assert hooks == {*ASK, *OBSERVERS}
 
 
 @pytest.mark.parametrize(
