@@ -12,11 +12,10 @@ from miniatures.runs import check_stage_two, miniature
 from miniatures.vanilla_3dgs import HOST, InterruptAt, joint, label
 
 from fragprune_mini_splatting import MiniSplatting
+from fragprune_plugins.adapting import HostRepo, read_ply
 from fragprune_plugins.errors import AlignmentError, Interrupted, SeamError, UnknownHostError
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.hosts.choosing import choose, locate
-from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.loading import load_plugins

@@ -13,9 +13,8 @@ from miniatures.runs import OPTIONS, check_stage_two, miniature
 from miniatures.vanilla_3dgs import Notes, joint
 from scenes import blended
 
+from fragprune_plugins.adapting import HostRepo, read_ply
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.files.ply import read_ply
-from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.run.work import measure_models, photographs_of

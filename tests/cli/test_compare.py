@@ -7,12 +7,10 @@ import torch
 from cli.commands import run, run_json
 from finetune import tiny
 
-from fragprune_plugins.types import RasterInputs
+from fragprune_plugins import RasterInputs, load_cameras, rasterize
 from fragprune_plugins.workbench.figures import evaluate
 from fragprune_plugins.workbench.figures.metrics import psnr
-from fragprune_plugins.workbench.figures.viewing import rasterize
 from fragprune_plugins.workbench.models.formats.ply import write_ply
-from fragprune_plugins.workbench.scenes.cameras import load_cameras
 
 FIGURES = ("psnr", "ssim", "fragments_per_pixel", "gaussians")
 

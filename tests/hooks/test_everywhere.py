@@ -8,14 +8,10 @@ from cli.commands import DRAWING, drawing, run, run_json
 from finetune import tiny
 
 import fragprune_plugins
+from fragprune_plugins import Pressure, RasterInputs, Schedule, Settings, ThresholdStore, finetune
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.learning.goals import Pressure
-from fragprune_plugins.learning.schedule import Schedule, Settings
-from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins.hookspecs import hookimpl
-from fragprune_plugins.types import RasterInputs
-from fragprune_plugins.workbench.finetune.api import finetune
 
 CUT_ALL = 0.999999
 HOST = fragprune_plugins.__path__[0] + "/workbench/demo/host/train.py"

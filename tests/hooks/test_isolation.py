@@ -9,15 +9,13 @@ import scenes
 import torch
 from miniatures.vanilla_3dgs import HOST, joint
 
+from fragprune_plugins import Settings, ThresholdStore
+from fragprune_plugins.adapting import HostRepo, hookimpl
 from fragprune_plugins.errors import InputError, PluginError, UnknownHostError
 from fragprune_plugins.hosts.choosing import choose
 from fragprune_plugins.hosts.findings import Match
-from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.hooks import engine_for, schedule_for, select_adapter, thresholds_for
-from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import Plugins
 from fragprune_plugins.workbench.check.work import models_of
 from fragprune_vanilla_3dgs import Vanilla3DGS
