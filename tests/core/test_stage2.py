@@ -138,6 +138,19 @@ def test_rates_follow_the_schedule():
     assert it.rate("opacity", 0.4) == 0.02
 
 
+def test_a_control_draws_without_thresholds_and_still_counts():
+    told = []
+    it = stage(settings=Settings(iterations=10, goal=Control()), watch=told.append)
+    it.begin(lambda: OPACITIES)
+    assert it.thresholds(None) is None
+    assert it.drew("a", drawing(None, 20.0), lambda: drawing(None, 20.0)) is None
+    it.end()
+    it.close()
+    assert it.store.neutral
+    assert it.store.steps == 0
+    assert [stats.fragments_per_pixel for stats in told] == [20.0]
+
+
 def test_a_loss_without_a_view_is_nobodys():
     it = stage()
     it.begin(lambda: OPACITIES)
