@@ -12,12 +12,7 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.constants import NEUTRAL_LOGIT, TILE
-from fragprune_plugins.engines.reference import (
-    ReferenceEngine,
-    camera_of,
-    gaussians_of,
-    options_of,
-)
+from fragprune_plugins.engines.reference import ReferenceEngine, camera_of, gaussians_of, options_of
 from fragprune_plugins.types import Compensation, Footprints, RasterInputs, Rim, Splats, View
 from reference_renderer import project
 

@@ -8,13 +8,12 @@ from miniatures.surfels import SurfelHost
 from miniatures.vanilla_3dgs import Notes, joint
 
 from fragprune_2dgs import SurfelSplatting
+from fragprune_plugins import Portable, Settings
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import InputError, UsageError
 from fragprune_plugins.files import records, sidecar
 from fragprune_plugins.injection import process
 from fragprune_plugins.injection.launch import RunOptions, run
-from fragprune_plugins.learning.goals import Portable
-from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.workbench.run.work import photographs_of
 
 COUNT = 16

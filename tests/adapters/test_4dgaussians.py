@@ -329,17 +329,6 @@ def test_rates_that_the_host_sets_in_every_iteration_stay_its_own(mini):
         assert rates["opacity"] < host.arguments.opacity_lr
 
 
-def test_a_batch_is_one_step(mini):
-    with joint(**of(mini)) as host:
-        model, camera = host.model(16), host.camera()
-        for _ in range(3):
-            images = [host.render(camera, model)["render"] for _ in range(2)]
-            torch.stack(images).mean().backward()
-            model.optimizer.step()
-        (state,) = host.models.values()
-        assert state.steps == 3
-
-
 # -- the call --------------------------------------------------------------------------------------
 
 

@@ -5,9 +5,8 @@ from miniatures.hosts import HOSTS
 from miniatures.runs import command, written
 from miniatures.vanilla_3dgs import HOST
 
-from fragprune_plugins.errors import UsageError
+from fragprune_plugins.adapting import HostRepo, UsageError
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.testing.conformance import found_adapter
 

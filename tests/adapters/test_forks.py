@@ -11,10 +11,8 @@ import torch
 from fragprune_3dgs_fork import ForkDialect
 from fragprune_3dgs_fork.fork import Fork, Output
 from fragprune_graphdeco import proof
+from fragprune_plugins.adapting import EngineError, HostCall, HostRepo
 from fragprune_plugins.engines import create_engine
-from fragprune_plugins.errors import EngineError
-from fragprune_plugins.hosts.dialect import HostCall
-from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.rasterizing import further_picture
 from fragprune_plugins.injection.state import ModelState
 from fragprune_plugins.learning.thresholds import ThresholdStore

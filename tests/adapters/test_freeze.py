@@ -24,21 +24,6 @@ def test_what_an_optimizer_beside_the_models_trains_moves_only_if_everything_doe
     assert torch.equal(exposure, torch.ones(3, 4)) == (train != "all")
 
 
-def test_before_stage_two_the_host_has_its_way():
-    with running(Settings(iterations=9, train="opacity"), from_step=1) as host:
-        model, camera = host.model(20), host.camera()
-        host.step(model, camera, 1)
-        model.xyz_gradient_accum += 1.0
-        model.densify_and_prune(1e-9, 0.005, 1.0, None)
-        model.oneupSHdegree()
-        assert len(model.get_xyz) > 20
-        assert model.active_sh_degree == 1
-        rows = len(model.get_xyz)
-        host.step(model, camera, 2)
-        model.densify_and_prune(1e-9, 0.005, 1.0, None)
-        assert len(model.get_xyz) == rows
-
-
 def test_on_a_cpu_adam_is_fused_in_stage_two_and_the_host_pickles_its_own():
     with running(Settings(iterations=5, train="appearance"), from_step=2) as host:
         model, camera = host.model(20), host.camera()

@@ -16,12 +16,11 @@ from miniatures.vanilla_3dgs import Notes, expect_ancestors, joint, label, runni
 from oracle import naive
 
 from fragprune_light_gaussian import LightGaussian
+from fragprune_plugins.adapting import hookimpl, read_ply
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.hosts.adapter import optimizer_state
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.plugins.hookspecs import hookimpl
 
 COUNT = 16
 

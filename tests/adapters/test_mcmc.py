@@ -1,7 +1,6 @@
 """3DGS-MCMC: relocation, addition and noise, on a miniature of the host."""
 
 import json
-import sys
 
 import pytest
 import torch
@@ -11,7 +10,7 @@ from miniatures.runs import OPTIONS, check_stage_two, miniature
 from miniatures.vanilla_3dgs import joint
 
 from fragprune_mcmc import MCMC
-from fragprune_plugins.errors import HostFailed, UsageError
+from fragprune_plugins.errors import UsageError
 from fragprune_plugins.injection.launch import run
 
 COUNT = 24
@@ -37,18 +36,6 @@ def test_parents_of_a_relocation_are_not_taken_for_those_of_a_later_append(mini)
         assert (values[-2:] < 1e-12).all()  # neutral: nobody's children
 
 
-def test_the_dialect_gives_three_outputs_and_thresholds_leave_radii_and_use_alone(mini):
-    with joint(**of(mini)) as host:
-        model, camera = host.model(COUNT), host.camera()
-        host.step(model, camera, 1)
-        with_thresholds = host.render(camera, model)
-        with host.paused():
-            without = host.render(camera, model)
-    for package in (with_thresholds, without):
-        assert package["is_used"] is None  # the host never reads it
-    assert torch.equal(with_thresholds["radii"], without["radii"])
-
-
 # -- stage 2 -------------------------------------------------------------------------------------
 
 
@@ -68,13 +55,7 @@ def test_train_then_finetune_moves_no_frozen_bit(mini, photographs, tmp_path):
     assert 150 < summary.gaussians <= 170
 
 
-# -- the host's own refusals, and files over the command line --------------------------------------
-
-
-def test_a_host_that_ends_early_with_success_is_a_stated_failure(mini, photographs, tmp_path):
-    with pytest.raises(HostFailed, match="without a checkpoint of iteration 12"):
-        run(command(mini, photographs, tmp_path / "out", 12), OPTIONS)
-    assert "scene" not in sys.modules
+# -- files over the command line -----------------------------------------------------------------
 
 
 def test_what_stage_two_changes_wins_over_the_configuration_file(mini, photographs, tmp_path):

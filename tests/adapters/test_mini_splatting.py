@@ -8,18 +8,16 @@ from importlib import import_module
 import pytest
 import torch
 from miniatures.mini_splatting import MiniSplattingHost
-from miniatures.runs import check_stage_two, frozen_differences, miniature
+from miniatures.runs import check_stage_two, miniature
 from miniatures.vanilla_3dgs import HOST, InterruptAt, joint, label
 
 from fragprune_mini_splatting import MiniSplatting
+from fragprune_plugins.adapting import HostRepo, read_ply
 from fragprune_plugins.errors import AlignmentError, Interrupted, SeamError, UnknownHostError
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.hosts.choosing import choose, locate
-from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import load_plugins
 
 mini, of = miniature(MiniSplattingHost, MiniSplatting)
@@ -106,44 +104,6 @@ def test_every_script_is_fine_tuned_and_only_opacities_move(trained):
     before = read_ply(summary.model_before)
     assert before.sh_degree == 1  # though ms and ms_d begin without a second band
     assert (len(before.xyz) != 150) or variant == "gs"
-
-
-def test_stage_two_stands_still_where_points_would_be_made_anew(mini, photographs, tmp_path):
-    """It passes depth's iteration and the simplifications; the host goes through the motions."""
-    more = ["--densify_until_iter", 10, "--depth_interval", 9]
-    more += ["--simp_iteration1", 10, "--simp_iteration2", 12]
-    options = replace(OPTIONS, settings=Settings(iterations=8, threshold_lr=0.3, train="opacity"))
-    summary = run(command(mini, "ms", photographs, tmp_path, 7, *more), options)
-    before = read_ply(summary.model_before)
-    assert frozen_differences(summary.model_before, summary.model_after) == []
-    store, _ = sidecar.load(summary.model_after)
-    assert len(store) == len(before.xyz)
-    assert store.steps == 8
-    assert before.f_rest.shape[1] == 0  # a model saved before simplification has no f_rest
-
-
-def test_thresholds_learn_through_new_points_and_simplification(mini, photographs, tmp_path, plug):
-    class Rows:
-        def __init__(self):
-            self.changes = []
-
-        @hookimpl
-        def fragprune_population_changed(self, store, change):
-            neutral = bool((store.logits <= -13).all())
-            self.changes.append((change.operation, change.before, change.after, neutral))
-
-    rows = Rows()
-    plug(rows)
-    options = replace(OPTIONS, stage="joint", from_iter=2)
-    summary = run(command(mini, "ms", photographs, tmp_path, 16), options)
-    store, _ = sidecar.load(summary.model_after)
-    assert len(store) == len(read_ply(summary.model_after).xyz)
-    anew = [change for change in rows.changes if change[0] == "training_setup"]
-    assert len(anew) == 2  # from depth at 6, from its own points at 10
-    assert all(neutral for *_, neutral in anew)
-    operation, before, after, neutral = rows.changes[-1]  # rows go, others keep what they have
-    assert (operation, neutral) == ("keep", False)
-    assert after < before
 
 
 def test_a_run_without_learning_keeps_the_thresholds_of_its_checkpoint(mini, photographs, tmp_path):

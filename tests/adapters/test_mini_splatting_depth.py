@@ -6,9 +6,8 @@ import torch
 from oracle import naive
 
 from fragprune_mini_splatting.depth import render_depth
+from fragprune_plugins.adapting import InputError, RasterInputs, Splats, View
 from fragprune_plugins.engines import create_engine
-from fragprune_plugins.errors import InputError
-from fragprune_plugins.types import RasterInputs, Splats, View
 
 WIDTH, HEIGHT = 37, 21
 

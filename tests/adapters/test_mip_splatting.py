@@ -17,9 +17,8 @@ from miniatures.runs import (
 from miniatures.vanilla_3dgs import Notes, joint, label, running
 
 from fragprune_mip_splatting import MipSplatting
-from fragprune_plugins.errors import NotComparedError
+from fragprune_plugins.adapting import HostRepo, NotComparedError
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
 
 COUNT = 16

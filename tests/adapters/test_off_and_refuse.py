@@ -6,9 +6,8 @@ from importlib import import_module
 import pytest
 from miniatures.vanilla_3dgs import HOST, imported
 
+from fragprune_plugins.adapting import HostRepo, Role, Seam
 from fragprune_plugins.errors import LateImportError, SeamError
-from fragprune_plugins.hosts.seams import Role, Seam
-from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import session as sessions
 from fragprune_plugins.injection.session import Session
 from fragprune_plugins.plugins.loading import load_plugins

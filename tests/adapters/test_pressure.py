@@ -7,9 +7,8 @@ import torch
 from miniatures.vanilla_3dgs import Notes, joint, running
 
 from fragprune_graphdeco import GraphdecoDialect
+from fragprune_plugins import Fewer, Portable, Pressure, Settings
 from fragprune_plugins.learning.area import area_per_pixel
-from fragprune_plugins.learning.goals import Fewer, Portable, Pressure
-from fragprune_plugins.learning.schedule import Settings
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 

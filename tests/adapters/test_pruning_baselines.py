@@ -16,11 +16,9 @@ from plyfile import PlyData
 
 from fragprune_compact_3dgs import Compact3DGS
 from fragprune_lp_3dgs import LP3DGS
+from fragprune_plugins.adapting import HostRepo, SeamCall, read_ply
 from fragprune_plugins.errors import EngineError, HostFailed, UsageError
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.files.ply import read_ply
-from fragprune_plugins.hosts.seams import SeamCall
-from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_speedy_splat import SpeedySplat

@@ -10,12 +10,11 @@ import torch
 from miniatures import runs
 from miniatures.rain_gs import RainHost
 from miniatures.runs import OPTIONS, check_stage_two, miniature
-from miniatures.vanilla_3dgs import Notes, joint, running
+from miniatures.vanilla_3dgs import Notes, joint
+from scenes import blended
 
-from fragprune_plugins import rasterize
+from fragprune_plugins.adapting import HostRepo, read_ply
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.files.ply import read_ply
-from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.run.work import measure_models, photographs_of
@@ -30,47 +29,24 @@ mini, of = miniature(RainHost, RainGS, driver=RainHost)
 # -- which host, and its rasterizer ----------------------------------------------------------------
 
 
-def test_our_rasterizer_answers_before_anything_is_compiled_and_leaves_again(mini):
-    with running(**of(mini)):
-        ours = import_module(PACKAGE)
-        renderer = import_module("gaussian_renderer")
-        assert renderer.GaussianRasterizer is ours.GaussianRasterizer
-    assert PACKAGE not in sys.modules
-
-
-def test_dilation_reaches_the_engine_and_depth_comes_back_without_a_gradient(mini):
+def test_dilation_reaches_the_engine_and_blended_depth_comes_back_without_a_gradient(mini):
     notes = Notes()
     with joint(**of(mini, plugins=[notes])) as host:
         model, camera = host.model(COUNT), host.camera(20, 14)
-        host.step(model, camera, 1)
+        host.store(model).open(host.adapter.opacities(model))
         render, pipe = import_module("gaussian_renderer").render, host.driver.pipe()
         wide = render(camera, model, pipe, torch.zeros(3), low_pass=40.0)
         assert notes.inputs.dilation == 40.0
         usual = render(camera, model, pipe, torch.zeros(3))
         assert notes.inputs.dilation == pytest.approx(0.3)
+        view, splats = notes.inputs.view, notes.inputs.splats
+        depths = splats.means @ view.viewmatrix[:3, 2] + view.viewmatrix[3, 2]
     assert (wide["radii"] > usual["radii"]).any()
     depth = usual["depth"]
-    assert depth.shape == (1, 14, 20)
+    torch.testing.assert_close(depth, blended(view, splats, depths), rtol=1e-4, atol=1e-4)
+    assert depth.any()
     assert not depth.requires_grad
     assert usual["render"].requires_grad
-
-
-def test_depth_is_the_blended_distance_of_what_is_drawn(mini):
-    """One Gaussian: depth over alpha is its own z wherever it is drawn."""
-    notes = Notes()
-    with joint(**of(mini, plugins=[notes])) as host:
-        model, camera = host.model(1), host.camera(20, 14)
-        host.step(model, camera, 1)
-        package = host.render(camera, model, torch.ones(3))
-        inputs = replace(notes.inputs, planes=("alpha",))
-        alpha = rasterize(inputs, host.store(model).values).alpha.detach()
-        point = torch.cat([model.get_xyz.detach()[0], torch.ones(1)])
-        z = float((point @ camera.world_view_transform)[2])
-    drawn = alpha > 0.01
-    assert drawn.any()
-    torch.testing.assert_close(
-        package["depth"][drawn] / alpha[drawn], torch.full_like(alpha, z)[drawn]
-    )
 
 
 # -- whole runs ----------------------------------------------------------------------------------

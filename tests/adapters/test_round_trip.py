@@ -6,12 +6,10 @@ import pytest
 import torch
 from miniatures.vanilla_3dgs import joint
 
+from fragprune_plugins import Control, Pressure, Settings, ThresholdStore
 from fragprune_plugins.errors import OutputError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply
-from fragprune_plugins.learning.goals import Control, Pressure
-from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.workbench.models.formats.ply import write_ply
 
 

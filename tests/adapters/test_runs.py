@@ -20,14 +20,11 @@ from miniatures import runs
 from miniatures.runs import OPTIONS, check_stage_two
 from miniatures.vanilla_3dgs import HOST, InterruptAt, run_script, running
 
-from fragprune_plugins.errors import Interrupted, SessionError, UsageError
+from fragprune_plugins import Portable, Schedule, Settings
+from fragprune_plugins.adapting import HostRepo, Interrupted, SessionError, UsageError, read_ply
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.files.ply import read_ply
-from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.injection.session import Session
-from fragprune_plugins.learning.goals import Portable
-from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.plugins.loading import installed, load_plugins
 from fragprune_vanilla_3dgs import Vanilla3DGS
 

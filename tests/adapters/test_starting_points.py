@@ -11,11 +11,10 @@ import torch
 from miniatures import runs
 from miniatures.vanilla_3dgs import HOST
 
+from fragprune_plugins import Control, Settings
 from fragprune_plugins.errors import HostFailed, ModelFileError, SidecarError, UsageError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection.launch import RunOptions, run
-from fragprune_plugins.learning.goals import Control
-from fragprune_plugins.learning.schedule import Settings
 
 command = partial(runs.command, HOST / "train.py")
 SETTINGS = Settings(iterations=6, threshold_lr=0.3, train="opacity")

@@ -8,8 +8,7 @@ from types import FunctionType
 
 import pytest
 
-from fragprune_plugins.hosts.adapter import HostAdapter, ScriptAdapter
-from fragprune_plugins.hosts.dialect import Dialect
+from fragprune_plugins.adapting import Dialect, HostAdapter, ScriptAdapter
 from fragprune_plugins.plugins.points import load, offered
 from fragprune_plugins.workbench.commands import GROUP
 

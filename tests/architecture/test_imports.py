@@ -129,20 +129,12 @@ KNOWN = {
     },
     # its host draws with gsplat; it activates a session itself, and ends it at Ctrl-C
     "fragprune_nerfstudio": {
-        "fragprune_gsplat",
-        "fragprune_gsplat.dialect",
-        "fragprune_plugins",
-        "fragprune_plugins.adapting",
-        "fragprune_plugins.errors",
-        "fragprune_plugins.injection",
-        "fragprune_plugins.injection.options",
-        "fragprune_plugins.injection.process",
-        "fragprune_plugins.injection.session",
-        "fragprune_plugins.learning.events",
-        "fragprune_plugins.learning.interruption",
-        "fragprune_plugins.learning.stage2",
-        "fragprune_plugins.learning.waiting",
-        "fragprune_plugins.plugins.loading",
+        *("fragprune_gsplat", "fragprune_gsplat.dialect", "fragprune_plugins"),
+        *("fragprune_plugins.adapting", "fragprune_plugins.errors", "fragprune_plugins.injection"),
+        *("fragprune_plugins.injection.options", "fragprune_plugins.injection.process"),
+        *("fragprune_plugins.injection.session", "fragprune_plugins.learning.events"),
+        *("fragprune_plugins.learning.interruption", "fragprune_plugins.learning.stage2"),
+        *("fragprune_plugins.learning.waiting", "fragprune_plugins.plugins.loading"),
     },
 }
 

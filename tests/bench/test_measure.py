@@ -13,24 +13,9 @@ from fragprune_plugins.workbench.bench.scene import make_scene, make_view
 from fragprune_plugins.workbench.bench.timing import Case, measure, translation
 
 ROW = {
-    "scene",
-    "width",
-    "height",
-    "gaussians",
-    "pass",
-    "engine",
-    "device",
-    "threads",
-    "truncated",
-    "fragments_per_pixel",
-    "evaluated_per_pixel",
-    "ms_median",
-    "ms_min",
-    "ms_se",
-    "ns_per_fragment",
-    "stages",
-    "peak_mb",
-    "difference",
+    *("scene", "width", "height", "gaussians", "pass", "engine", "device", "threads", "truncated"),
+    *("fragments_per_pixel", "evaluated_per_pixel", "ms_median", "ms_min", "ms_se"),
+    *("ns_per_fragment", "stages", "peak_mb", "difference"),
 }
 
 

@@ -5,9 +5,8 @@ import hashlib
 import pytest
 import torch
 
+from fragprune_plugins import Model, RasterInputs
 from fragprune_plugins.engines import create_engine
-from fragprune_plugins.files.model import Model
-from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.bench.scene import make_scene, make_view
 
 COLUMNS = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")

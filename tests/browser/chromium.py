@@ -26,18 +26,10 @@ EXECUTABLE = Path("/usr/bin/chromium")
 """Debian's. No browser is ever downloaded."""
 
 FLAGS = (
-    "--no-sandbox",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--use-angle=swiftshader",  # WebGL in software: the same on every machine
-    "--enable-unsafe-swiftshader",
-    "--enable-unsafe-webgpu",  # WebGPU likewise; without Vulkan its first canvas ends the device
-    "--use-webgpu-adapter=swiftshader",
-    "--enable-features=Vulkan",
-    "--use-vulkan=swiftshader",
+    *("--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"),
+    *("--disable-component-update", "--disable-sync", "--use-angle=swiftshader"),
+    *("--enable-unsafe-swiftshader", "--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader"),
+    *("--enable-features=Vulkan", "--use-vulkan=swiftshader"),
 )
 
 

@@ -3,12 +3,9 @@
 import numpy as np
 import torch
 
-from fragprune_plugins import RasterInputs, rasterize
-from fragprune_plugins.files.model import Model
-from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.types import RasterOutputs, View
+from fragprune_plugins import RasterInputs, ThresholdStore, look_at, rasterize
+from fragprune_plugins.adapting import Model, RasterOutputs, View
 from fragprune_plugins.workbench.models.cutoffs import decode, encode
-from fragprune_plugins.workbench.scenes.pinhole import look_at
 
 COUNT = 600
 

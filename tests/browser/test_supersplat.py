@@ -20,10 +20,8 @@ from browser.engines import placed
 from cli.commands import run_json
 from finetune import tiny
 
-from fragprune_plugins.files.model import Model
+from fragprune_plugins import Model, ThresholdStore, View
 from fragprune_plugins.files.ply import read_ply
-from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.types import View
 from fragprune_plugins.workbench.models.formats.ply import write_ply
 
 pytestmark = pytest.mark.browser

@@ -9,11 +9,8 @@ from browser.chromium import opened, served
 from browser.viewing import decibels, engine_frame, frame, hold, viewing, write_page
 from finetune import tiny
 
-from fragprune_plugins.files.model import Model
-from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.types import View
+from fragprune_plugins import Model, ThresholdStore, View, load_dataset
 from fragprune_plugins.workbench.models import formats
-from fragprune_plugins.workbench.scenes.dataset import load_dataset
 from fragprune_plugins.workbench.view.site import (
     Layer,
     Shown,

@@ -11,9 +11,7 @@ import numpy as np
 import torch
 from browser.chromium import Tab, opened, served
 
-from fragprune_plugins import rasterize
-from fragprune_plugins.files.model import Model
-from fragprune_plugins.types import RasterInputs, View
+from fragprune_plugins import Model, RasterInputs, View, rasterize
 from fragprune_plugins.workbench.view.site import Layer, camera, make_site, save_site
 
 

@@ -8,8 +8,7 @@ import pytest
 from cli.commands import run, run_json
 from miniatures.skeletons import skeleton
 
-from fragprune_plugins.hosts.seams import Role, Seam
-from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.adapting import HostRepo, Role, Seam
 from fragprune_plugins.testing import mutations
 from fragprune_plugins.workbench import demo
 from fragprune_plugins.workbench.check import work

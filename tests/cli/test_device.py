@@ -12,8 +12,7 @@ from cli.commands import drawing, run
 from finetune import tiny
 
 from fragprune_plugins import engines
-from fragprune_plugins.files.ply import read_ply
-from fragprune_plugins.hosts.photographs import Photographs
+from fragprune_plugins.adapting import Photographs, read_ply
 from fragprune_plugins.plugins.loading import installed
 from fragprune_plugins.workbench.commands import opening
 from fragprune_plugins.workbench.commands.options import EngineOptions

@@ -9,9 +9,8 @@ from cli.commands import fails, run, run_json
 from finetune import tiny
 
 import fragprune_plugins as fp
+from fragprune_plugins import RasterInputs, Schedule, Settings
 from fragprune_plugins.learning.pressure import OWN_PRESSURE
-from fragprune_plugins.learning.schedule import Schedule, Settings
-from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.figures.metrics import psnr
 
 

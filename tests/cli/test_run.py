@@ -12,9 +12,8 @@ from miniatures.runs import TINY
 from miniatures.vanilla_3dgs import HOST
 
 from fragprune_plugins import load
-from fragprune_plugins.errors import ModelFileError, UsageError
+from fragprune_plugins.adapting import HostRepo, ModelFileError, UsageError
 from fragprune_plugins.files import records
-from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import launch
 from fragprune_plugins.learning.schedule import USUAL_STOP
 from fragprune_plugins.testing import mutations

@@ -7,9 +7,8 @@ import torch
 
 from fragprune_graphdeco import GraphdecoDialect
 from fragprune_graphdeco.adapter import completed
-from fragprune_plugins.hosts.adapter import CHECKPOINT_KEY
+from fragprune_plugins.adapting import CHECKPOINT_KEY, Role, revised
 from fragprune_plugins.hosts.findings import Match
-from fragprune_plugins.hosts.seams import Role, revised
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 

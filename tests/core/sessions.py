@@ -7,11 +7,9 @@ from types import SimpleNamespace
 
 import torch
 
-from fragprune_plugins.hosts.adapter import ParamGroup
-from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
+from fragprune_plugins import Settings, ThresholdStore
+from fragprune_plugins.adapting import ParamGroup, Role, Seam, SeamCall
 from fragprune_plugins.injection.state import ModelState, SessionState
-from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.learning.thresholds import ThresholdStore
 
 
 class Model:

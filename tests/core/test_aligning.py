@@ -6,8 +6,7 @@ import pytest
 import torch
 from core.sessions import Model, Role, call, follow, state
 
-from fragprune_plugins.errors import AlignmentError
-from fragprune_plugins.hosts.seams import RowTrace
+from fragprune_plugins.adapting import AlignmentError, RowTrace
 from fragprune_plugins.injection.session import OF_MODELS
 
 LOGITS = -3 + torch.arange(6.0) / 8

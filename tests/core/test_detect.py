@@ -3,11 +3,10 @@
 import pytest
 from miniatures.skeletons import FLAGS, GROUPS, SETTINGS, STATES, skeleton
 
+from fragprune_plugins.adapting import HostRepo, Role, Seam, revised
 from fragprune_plugins.errors import UnknownHostError
 from fragprune_plugins.hosts.choosing import choose, locate
 from fragprune_plugins.hosts.findings import Match
-from fragprune_plugins.hosts.seams import Role, Seam, revised
-from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_vanilla_3dgs import Vanilla3DGS
 

@@ -3,12 +3,8 @@
 import pytest
 import torch
 
-from fragprune_plugins.learning.goals import Pressure
-from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins import Pressure, RasterInputs, Settings, Splats, ThresholdStore, look_at
 from fragprune_plugins.learning.stage2 import OPAQUE, Stage2
-from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.types import RasterInputs, Splats
-from fragprune_plugins.workbench.scenes.pinhole import look_at
 
 COUNT, STEPS = 20_000, 10
 VIEW = look_at((0, 0, -3), (0, 0, 0), width=8, height=8, fov_y=50)

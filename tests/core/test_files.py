@@ -10,14 +10,7 @@ import pytest
 
 from fragprune_plugins.errors import OutputError
 from fragprune_plugins.files import atomic
-from fragprune_plugins.files.atomic import (
-    all_in_flight,
-    digest,
-    in_flight,
-    locked,
-    put,
-    replacing,
-)
+from fragprune_plugins.files.atomic import all_in_flight, digest, in_flight, locked, put, replacing
 from fragprune_plugins.workbench.models.model import writable_folder
 
 

@@ -8,9 +8,7 @@ from hypothesis import strategies as st
 from miniatures.skeletons import skeleton
 
 from fragprune_graphdeco.adapter import resolution
-from fragprune_plugins.errors import NotComparedError
-from fragprune_plugins.hosts.photographs import Photographs, Resolution
-from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.adapting import HostRepo, NotComparedError, Photographs, Resolution
 from fragprune_plugins.workbench.demo import work
 from fragprune_vanilla_3dgs import Vanilla3DGS
 

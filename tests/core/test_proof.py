@@ -14,11 +14,10 @@ from miniatures import compiled, vanilla_3dgs
 from miniatures.compiled import DIFFERENCES
 
 from fragprune_graphdeco.proof import RasterizerProver
+from fragprune_plugins import Pressure, Settings
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import EngineError, ProofError
 from fragprune_plugins.injection import rasterizing
-from fragprune_plugins.learning.goals import Pressure
-from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.testing.invariants.case import FixedThresholds, open_all
 from fragprune_vanilla_3dgs import Vanilla3DGS
 from reference_renderer.covariance import rotation_matrices

@@ -18,6 +18,7 @@ from finetune import tiny
 from PIL import Image
 
 import fragprune_plugins
+from fragprune_plugins import View, load_cameras
 from fragprune_plugins.errors import (
     DatasetError,
     InputError,
@@ -33,10 +34,8 @@ from fragprune_plugins.files.reading import NESTING, Door, lies_in
 from fragprune_plugins.hosts.adapter import ConfigFile, read_config
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.starting import _read_checkpoint
-from fragprune_plugins.types import View
 from fragprune_plugins.workbench.models.formats.ply import write_ply
 from fragprune_plugins.workbench.scenes import colmap
-from fragprune_plugins.workbench.scenes.cameras import load_cameras
 from fragprune_plugins.workbench.scenes.dataset import Photograph
 from fragprune_plugins.workbench.scenes.pinhole import Camera
 

@@ -7,13 +7,12 @@ import pytest
 import torch
 from miniatures.vanilla_3dgs import joint, running
 
+from fragprune_plugins import Control, Portable, Pressure, Settings
 from fragprune_plugins.errors import RanksError, SessionError
 from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
 from fragprune_plugins.injection import ranks
 from fragprune_plugins.injection.rasterizing import on_metric
 from fragprune_plugins.injection.session import active_session
-from fragprune_plugins.learning.goals import Control, Portable, Pressure
-from fragprune_plugins.learning.schedule import Settings
 
 
 @pytest.fixture

@@ -6,9 +6,8 @@ import pytest
 import torch
 from torch.nn.functional import conv2d
 
+from fragprune_plugins.adapting import HostRepo, Role, Seam, SeamCall
 from fragprune_plugins.engines.cpu import binding
-from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
-from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.similarity import on_similarity, seam_of
 
 SEAM = Seam(Role.SIMILARITY, "utils.loss_utils", "ssim", ("img1", "img2"))

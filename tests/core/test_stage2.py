@@ -9,11 +9,10 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from fragprune_plugins import Control, Fewer, Pressure, ThresholdStore
 from fragprune_plugins.errors import ResetError, UsageError
-from fragprune_plugins.learning.goals import Control, Fewer, Pressure
 from fragprune_plugins.learning.schedule import JointSchedule, Schedule, Settings, StepPlan
 from fragprune_plugins.learning.stage2 import Stage2, evenly, stored_thresholds
-from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.workbench.finetune.faster import FrameTarget
 from fragprune_plugins.workbench.finetune.processes import SharedStage
 from fragprune_plugins.workbench.goals import TIME_FOLLOWS, Faster

@@ -47,14 +47,8 @@ def test_report_has_the_names_of_every_report(demo):
     out, report, _ = demo
     for side in ("before", "after", "control"):
         assert {
-            "psnr",
-            "ssim",
-            "lpips",
-            "fragments_per_pixel",
-            "evaluated_per_pixel",
-            "gaussians",
-            "frame_ms",
-            "frame_ms_se",
+            *("psnr", "ssim", "lpips", "fragments_per_pixel", "evaluated_per_pixel", "gaussians"),
+            *("frame_ms", "frame_ms_se"),
         } <= report[side].keys()
     assert report["after"]["fragments_per_pixel"] < report["before"]["fragments_per_pixel"]
     assert report["after"]["gaussians"] == report["before"]["gaussians"]

@@ -17,12 +17,10 @@ from typing import Any
 import torch
 from cli.commands import run as run_command
 
+from fragprune_plugins import Control, Fewer, Portable, Settings, joined
 from fragprune_plugins.errors import FragpruneError
-from fragprune_plugins.learning.goals import Control, Fewer, Portable
-from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.stage2 import Stage2
 from fragprune_plugins.workbench.finetune import loop
-from fragprune_plugins.workbench.ranks import joined
 
 LONGEST = 60  # seconds that a child may live
 STEPS = 12

@@ -12,10 +12,9 @@ from finetune import tiny
 from finetune.tiny import NAMES, stems
 from PIL import Image
 
+from fragprune_plugins import load_cameras, measure
 from fragprune_plugins.errors import DatasetError
-from fragprune_plugins.workbench.figures.evaluate import measure
 from fragprune_plugins.workbench.finetune.loop import photometric_loss
-from fragprune_plugins.workbench.scenes.cameras import load_cameras
 from fragprune_plugins.workbench.scenes.dataset import Pictures, Slot, load_dataset
 from fragprune_plugins.workbench.scenes.posed import Posed, split
 

@@ -7,11 +7,9 @@ import pytest
 import torch
 from finetune import tiny
 
+from fragprune_plugins import Pressure, Schedule, Settings, StepPlan, finetune
 from fragprune_plugins.learning.events import StepStats
-from fragprune_plugins.learning.goals import Pressure
-from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
 from fragprune_plugins.testing.fresh import fresh
-from fragprune_plugins.workbench.finetune.api import finetune
 
 PAGE = 4096
 A_POINT = 600  # bytes of one point of the curves, which are kept on purpose

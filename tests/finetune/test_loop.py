@@ -7,16 +7,13 @@ import pytest
 import torch
 from finetune import tiny
 
+from fragprune_plugins import Control, Faster, Fewer, Pressure, ThresholdStore, finetune
+from fragprune_plugins.adapting import RasterInputs
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import AlignmentError, DivergedError, UsageError
-from fragprune_plugins.learning.goals import Control, Fewer, Pressure
 from fragprune_plugins.learning.schedule import USUAL_STOP, Schedule, Settings
 from fragprune_plugins.learning.targets import calibrate
-from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.finetune import faster, loop
-from fragprune_plugins.workbench.finetune.api import finetune
-from fragprune_plugins.workbench.goals import Faster
 
 ALL = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
 

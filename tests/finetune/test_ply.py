@@ -11,8 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 
-from fragprune_plugins.errors import InputError, ModelFileError
-from fragprune_plugins.files.model import Model
+from fragprune_plugins.adapting import InputError, Model, ModelFileError
 from fragprune_plugins.files.ply import expect_drawable, read_ply
 from fragprune_plugins.workbench.models.formats.ply import write_ply
 

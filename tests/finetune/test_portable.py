@@ -8,16 +8,12 @@ from cli.commands import run, run_json
 from finetune import tiny
 
 import fragprune_plugins as fp
+from fragprune_plugins import Control, Portable, Schedule, Settings, ThresholdStore, finetune
+from fragprune_plugins.adapting import RasterInputs, UsageError
 from fragprune_plugins.engines import create_engine
-from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.learning.goals import Control, Portable
 from fragprune_plugins.learning.pressure import OWN_AREA_PRESSURE, PORTABLE_ELASTICITY
-from fragprune_plugins.learning.schedule import Schedule, Settings
-from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.figures.evaluate import covered_per_pixel
-from fragprune_plugins.workbench.finetune.api import finetune
 
 
 @pytest.fixture

@@ -14,14 +14,11 @@ from finetune.several import CASES, STEPS, launch, learn, lose_nan
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fragprune_plugins import Control, Faster, Pressure, Schedule, Settings, finetune
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.learning.goals import Control, Pressure
-from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.workbench import ranks as module
 from fragprune_plugins.workbench.finetune import loop, processes
-from fragprune_plugins.workbench.finetune.api import finetune
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
-from fragprune_plugins.workbench.goals import Faster
 from fragprune_plugins.workbench.ranks import Ranks, fingerprint, launched, speaks
 
 ALL = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")

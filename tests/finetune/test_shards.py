@@ -11,13 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scenes import with_cov3d
 
+from fragprune_plugins import Portable, RasterInputs, Settings, Splats, ThresholdStore, finetune
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import DivergedError, InputError, UsageError
-from fragprune_plugins.learning.goals import Portable
-from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.stage2 import Stage2
-from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.types import RasterInputs, Splats
 from fragprune_plugins.workbench.distributed import (
     ShardedEngine,
     Shards,
@@ -25,7 +22,6 @@ from fragprune_plugins.workbench.distributed import (
     reaching,
     whole_of,
 )
-from fragprune_plugins.workbench.finetune.api import finetune
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
 from fragprune_plugins.workbench.ranks import Ranks
 

@@ -13,12 +13,8 @@ import pytest
 import torch
 from miniatures.vanilla_3dgs import running
 
-from fragprune_plugins.files.ply import read_ply
-from fragprune_plugins.learning.goals import Control, Fewer, Pressure
-from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
-from fragprune_plugins.plugins.hookspecs import hookimpl
-from fragprune_plugins.types import View
-from fragprune_plugins.workbench.finetune.api import finetune
+from fragprune_plugins import Control, Fewer, Pressure, Schedule, Settings, StepPlan, View, finetune
+from fragprune_plugins.adapting import hookimpl, read_ply
 from fragprune_plugins.workbench.finetune.losses import photometric_loss
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 

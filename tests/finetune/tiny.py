@@ -14,10 +14,7 @@ import pytest
 import torch
 from PIL import Image
 
-from fragprune_plugins import rasterize
-from fragprune_plugins.files.model import Model
-from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.types import RasterInputs
+from fragprune_plugins import Model, RasterInputs, ThresholdStore, rasterize
 from fragprune_plugins.workbench.figures import evaluate
 from fragprune_plugins.workbench.finetune import faster, loop
 from fragprune_plugins.workbench.models.formats.ply import write_ply

@@ -8,12 +8,10 @@ import pytest
 import torch
 from PIL import Image
 
-from fragprune_plugins import load
+from fragprune_plugins import RasterInputs, load, load_cameras
 from fragprune_plugins.engines import create_engine
-from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.figures.metrics import psnr
 from fragprune_plugins.workbench.models.cutoffs import encode
-from fragprune_plugins.workbench.scenes.cameras import load_cameras
 
 
 @pytest.fixture(scope="module")

@@ -131,10 +131,8 @@ def script(
 
 
 def test_the_driver_is_asked_for_what_the_emulation_does(script: Callable[[str], str]) -> None:
+    """And drawing on another GPU leaves the current one; one test, for its kernels take long."""
     said = script(BOTH_KINDS_OF_CODE)
     assert "fp_blend from machine code" in said
     assert "fp_chain from PTX" in said
-
-
-def test_drawing_on_another_gpu_leaves_the_current_one(script: Callable[[str], str]) -> None:
     script(ANOTHER_GPU)

@@ -4,12 +4,10 @@ import pytest
 import torch
 from finetune import tiny
 
+from fragprune_plugins import Pressure, Settings, finetune
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.engines.cuda.engine import CudaEngine
-from fragprune_plugins.learning.goals import Pressure
-from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
-from fragprune_plugins.workbench.finetune.api import finetune
 
 
 def test_learned_and_measured_as_on_the_cpu(engine: CudaEngine, tmp_path) -> None:

@@ -6,10 +6,8 @@ import torch
 from finetune import tiny
 from finetune.several import learn
 
+from fragprune_plugins import RasterInputs, ShardedEngine, ThresholdStore, part_of
 from fragprune_plugins.engines.cuda.engine import CudaEngine
-from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.types import RasterInputs
-from fragprune_plugins.workbench.distributed import ShardedEngine, part_of
 from fragprune_plugins.workbench.ranks import Ranks
 
 LEARNED = ("xyz", "f_rest", "opacity", "scaling")

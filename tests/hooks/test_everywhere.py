@@ -8,15 +8,10 @@ from cli.commands import DRAWING, drawing, run, run_json
 from finetune import tiny
 
 import fragprune_plugins
+from fragprune_plugins import Pressure, RasterInputs, Schedule, Settings, ThresholdStore, finetune
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.learning.goals import Pressure
-from fragprune_plugins.learning.schedule import Schedule, Settings
-from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins.hookspecs import hookimpl
-from fragprune_plugins.types import RasterInputs
-from fragprune_plugins.workbench.figures.evaluate import Candidate, measure, measure_all
-from fragprune_plugins.workbench.finetune.api import finetune
 
 CUT_ALL = 0.999999
 HOST = fragprune_plugins.__path__[0] + "/workbench/demo/host/train.py"
@@ -184,12 +179,3 @@ def test_an_engine_is_created_once_for_a_name_and_a_device(model, plug):
     for _ in range(3):
         fragprune_plugins.rasterize(inputs)
     assert made == [("auto", "cpu")]
-
-
-def test_a_store_is_measured_as_its_thresholds_are(model, dataset):
-    pruned = tiny.cut(model, 0.2)
-    as_they_are = Candidate(model, cut=torch.full((len(model),), 0.2))
-    one = measure(pruned, dataset, repeats=1)
-    other = measure_all([as_they_are], dataset.test, repeats=1)[0]
-    for key in ("psnr", "ssim", "fragments_per_pixel", "evaluated_per_pixel"):
-        assert one[key] == other[key]

@@ -10,16 +10,12 @@ import scenes
 import torch
 from miniatures.vanilla_3dgs import HOST, joint, running
 
+from fragprune_plugins import Pressure, Schedule, Settings, ThresholdStore
+from fragprune_plugins.adapting import HostRepo, Plain, hookimpl
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.hosts.choosing import choose
-from fragprune_plugins.hosts.findings import Plain
-from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.learning.goals import Pressure
-from fragprune_plugins.learning.schedule import Schedule, Settings
-from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.hooks import select_adapter, thresholds_for
-from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import Plugins
 from fragprune_plugins.workbench.check.work import judge, models_of
 from fragprune_vanilla_3dgs import Vanilla3DGS

@@ -4,10 +4,9 @@ import logging
 
 import pytest
 
+from fragprune_plugins.adapting import HostAdapter, hookimpl
 from fragprune_plugins.errors import PluginError
-from fragprune_plugins.hosts.adapter import HostAdapter
 from fragprune_plugins.plugins import hookspecs, loading
-from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import Plugins, installed, load_plugins
 from fragprune_vanilla_3dgs import Vanilla3DGS
 

@@ -11,8 +11,7 @@ import numpy as np
 import torch
 
 from fragprune_gsplat import GROUPS
-from fragprune_plugins.files.ply import read_ply
-from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.adapting import HostRepo, read_ply
 from fragprune_plugins.injection.session import active_session
 from fragprune_plugins.testing import Chance, Host
 from fragprune_plugins.testing.host import FAINT, Action

@@ -8,10 +8,8 @@ import pytest
 import torch
 
 from fragprune_gaussian_splatting import GaussianSplatting
-from fragprune_plugins.errors import SessionError
+from fragprune_plugins.adapting import HostRepo, SessionError, read_ply
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.files.ply import read_ply
-from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_vanilla_3dgs import Vanilla3DGS

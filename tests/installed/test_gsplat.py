@@ -19,10 +19,9 @@ from installed.gsplat_host import draw as drawn_by_gsplat
 
 from fragprune_gsplat import Gsplat
 from fragprune_gsplat.projection import covariances
+from fragprune_plugins.adapting import HostRepo, read_ply
 from fragprune_plugins.errors import InputError, SessionError, SidecarError, UsageError
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.files.ply import read_ply
-from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.goals import Fewer
 from fragprune_plugins.learning.schedule import JointSchedule, Settings

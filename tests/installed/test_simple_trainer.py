@@ -11,13 +11,11 @@ from installed.gsplat_host import releases
 
 from fragprune_gsplat import Gsplat
 from fragprune_gsplat.trainer import SimpleTrainer
+from fragprune_plugins import Control, Pressure, Settings
+from fragprune_plugins.adapting import HostRepo, Photographs
 from fragprune_plugins.errors import EngineError, NotComparedError, SidecarError, UsageError
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.hosts.photographs import Photographs
-from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
-from fragprune_plugins.learning.goals import Control, Pressure
-from fragprune_plugins.learning.schedule import Settings
 
 SCRIPT = Path(__file__).parents[1] / "miniatures" / "simple_trainer.py"
 RELEASES = releases()

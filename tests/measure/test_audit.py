@@ -10,11 +10,9 @@ from finetune import tiny
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fragprune_plugins import RasterInputs, ThresholdStore, engine_for
 from fragprune_plugins.engines.fragments import fragments
 from fragprune_plugins.engines.reference import ReferenceEngine
-from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.plugins.hooks import engine_for
-from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.audit.audit import (
     AS_IT_IS,
     HALF_LEVEL,

@@ -9,20 +9,9 @@ from fragprune_plugins.workbench.figures.evaluate import Candidate, measure, mea
 from fragprune_plugins.workbench.figures.pictures import save_image, save_panel
 
 NAMES = {
-    "target",
-    "psnr",
-    "ssim",
-    "lpips",
-    "fragments_per_pixel",
-    "evaluated_per_pixel",
-    "entries_per_pixel",
-    "area_per_pixel",
-    "gaussians",
-    "frame_ms",
-    "frame_ms_se",
-    "engine",
-    "device",
-    "views",
+    *("target", "psnr", "ssim", "lpips", "fragments_per_pixel", "evaluated_per_pixel"),
+    *("entries_per_pixel", "area_per_pixel", "gaussians", "frame_ms", "frame_ms_se", "engine"),
+    *("device", "views"),
 }
 
 

@@ -6,11 +6,9 @@ import pytest
 import torch
 from finetune import tiny
 
+from fragprune_plugins import Model, RasterInputs, look_at
 from fragprune_plugins.engines.reference import ReferenceEngine
-from fragprune_plugins.files.model import Model
-from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.figures.extents import CUTS, SQRT8, VIEWERS, Extent, Viewer, shaded
-from fragprune_plugins.workbench.scenes.pinhole import look_at
 
 BY_NAME = {viewer.names.split(",")[0]: viewer for viewer in VIEWERS}
 

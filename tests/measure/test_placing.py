@@ -5,8 +5,7 @@ import math
 import pytest
 import torch
 
-from fragprune_plugins.files.model import Model
-from fragprune_plugins.plugins.hooks import engine_for
+from fragprune_plugins import Model, engine_for
 from fragprune_plugins.workbench.audit.placing import place
 
 ENGINE = engine_for("auto", "cpu")

@@ -7,10 +7,9 @@ import torch
 from finetune import tiny
 from oracle import naive
 
+from fragprune_plugins import RasterInputs, ThresholdStore
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import InputError
-from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench import pruning as scores
 
 COUNT = 20

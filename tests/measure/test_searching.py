@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fragprune_plugins.learning.goals import Control
+from fragprune_plugins import AtMost, Control, Settings
 from fragprune_plugins.learning.interruption import Terminate
-from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.workbench.finetune import searching
 from fragprune_plugins.workbench.finetune.searching import (
     TOLERANCE,
@@ -18,7 +17,6 @@ from fragprune_plugins.workbench.finetune.searching import (
     next_pressure,
     strongest,
 )
-from fragprune_plugins.workbench.goals import AtMost
 
 
 def search(loss_of, bound: float, start: float) -> list[Trial]:

@@ -9,10 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fragprune_plugins import rasterize
-from fragprune_plugins.constants import ALPHA_MIN
+from fragprune_plugins.adapting import ALPHA_MIN, InputError, RasterInputs, Splats
 from fragprune_plugins.engines import create_engine
-from fragprune_plugins.errors import InputError
-from fragprune_plugins.types import RasterInputs, Splats
 from fragprune_plugins.workbench.pruning import visible
 
 VIEWS = [camera.view() for camera in tiny.cameras()]

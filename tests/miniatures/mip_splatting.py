@@ -40,12 +40,10 @@ class Added:
     def _reset_statistics(self):
         self.vanilla_reset_statistics()
         self.xyz_gradient_accum_abs = torch.zeros_like(self.denom)
-        self.xyz_gradient_accum_abs_max = torch.zeros_like(self.denom)
 
     def prune_points(self, mask):
         self.vanilla_prune_points(mask)
-        for name in ("xyz_gradient_accum_abs", "xyz_gradient_accum_abs_max"):
-            setattr(self, name, getattr(self, name)[~mask])
+        self.xyz_gradient_accum_abs = self.xyz_gradient_accum_abs[~mask]
 
     def add_densification_stats(self, viewspace_point_tensor, update_filter):
         self.vanilla_add_densification_stats(viewspace_point_tensor, update_filter)
@@ -240,7 +238,6 @@ class MipHost(Descendant):
 
         def both(model: Any, arguments: Any, chance: Any) -> None:
             model.xyz_gradient_accum_abs = chance.uniform(len(model.get_xyz), 1)
-            model.xyz_gradient_accum_abs_max = model.xyz_gradient_accum_abs
             shared["densify and prune"](model, arguments, chance)
 
         return {

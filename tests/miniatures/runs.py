@@ -9,16 +9,14 @@ import pytest
 import torch
 from PIL import Image
 
-from fragprune_plugins import rasterize
+from fragprune_plugins import Settings, load_dataset, rasterize
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.injection.launch import RunOptions
-from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.testing import Host
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.run.work import measure_models, photographs_of
-from fragprune_plugins.workbench.scenes.dataset import load_dataset
 
 TINY = [
     *("-r", "1", "--sh_degree", "1", "--eval"),

@@ -9,13 +9,12 @@ import scenes
 import spacetime
 import torch
 
+from fragprune_plugins.adapting import EngineError, Footprints, RasterInputs, Splats, View
 from fragprune_plugins.engines.calling import address, native_arrays, native_inputs
 from fragprune_plugins.engines.cpu.engine import CpuEngine, binding
 from fragprune_plugins.engines.reference import ReferenceEngine
-from fragprune_plugins.errors import EngineError
 from fragprune_plugins.slicing.cutting import Way, slice_by
 from fragprune_plugins.slicing.structs import Spacetime
-from fragprune_plugins.types import Footprints, RasterInputs, Splats, View
 
 N = 20
 WORLD = scenes.random_scene(0, N, features=2, stop=0.3)

@@ -14,14 +14,11 @@ from hypothesis import strategies as st
 from fragprune_nerfstudio import METHOD, Nerfstudio, exported
 from fragprune_nerfstudio.command import rewritten
 from fragprune_nerfstudio.exporting import COLUMNS, rows_among, rows_exported
-from fragprune_plugins import Settings
-from fragprune_plugins.errors import AlignmentError, UsageError
+from fragprune_plugins import Control, Settings, ThresholdStore
+from fragprune_plugins.adapting import AlignmentError, HostRepo, UsageError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.hosts.choosing import usage
-from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import command, saving, session
-from fragprune_plugins.learning.goals import Control
-from fragprune_plugins.learning.thresholds import ThresholdStore
 
 # -- what it costs whoever has no nerfstudio
 

@@ -9,9 +9,7 @@ import pytest
 import torch
 from finetune import tiny
 
-from fragprune_plugins.files.model import Model
-from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.workbench.figures.viewing import overview
+from fragprune_plugins import Model, ThresholdStore, overview
 from fragprune_plugins.workbench.models import formats
 from fragprune_plugins.workbench.models.formats.arrays import morton_order
 from fragprune_plugins.workbench.view.packing import compact, pack

@@ -12,14 +12,12 @@ from campaigns.fuzz import seeds
 from finetune import tiny
 from miniatures.vanilla_3dgs import HOST
 
+from fragprune_plugins.adapting import HostRepo, RasterInputs, UsageError, View
 from fragprune_plugins.engines import create_engine
-from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files import records, sidecar
 from fragprune_plugins.hosts.adapter import ConfigFile, read_config
 from fragprune_plugins.hosts.preflight import missing_imports
-from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.starting import resumed_at
-from fragprune_plugins.types import RasterInputs, View
 from fragprune_plugins.workbench import finetune
 from fragprune_plugins.workbench.figures.recorded import recorded
 from fragprune_plugins.workbench.finetune import checkpoints
