@@ -144,9 +144,9 @@ class PatchLedger:
             name
             for name, other in list(sys.modules.items())
             if other is not module
-            and (not seam.external or self._is_hosts(other))
             and original is not None
             and getattr(other, "__dict__", {}).get(head) is original
+            and (not seam.external or self._is_hosts(other))
         ]
         if holders:
             raise LateImportError(
