@@ -208,6 +208,9 @@ def _read_scripts(fork: Fork, scripts: tuple[str, ...]) -> None:
         made = [each for each in reading.made_models(repo, _module(script)) if each not in networks]
         if CLASS in made and len(set(made)) == 1:
             fork.scripts += (script,)
+            if lacking := _lacking(repo, script):
+                found = f"its call of {CLASS} lacks {lacking}, which fails"
+                fork.refuse("script", script, found, "a script that runs")
             if len(made) > 1 or _in_loop(tree, CLASS):
                 fork.one_run = f"{script} makes several models"
         elif made:
@@ -218,6 +221,21 @@ def _read_scripts(fork: Fork, scripts: tuple[str, ...]) -> None:
         fork.refuse("other-host", str(repo.root), found, "a *train*.py that makes GaussianModels")
     for script in fork.scripts:
         _check_script(fork, script)
+
+
+def _lacking(repo: HostRepo, script: str) -> str:
+    """A parameter of the model's class that a script's call does not give; "" for none."""
+    function = repo.function(MODEL, f"{CLASS}.__init__")
+    if function is None:
+        return ""
+    own = [each.arg for each in function.args.args[1:]]
+    needed = own[: len(own) - len(function.args.defaults)]
+    for call in repo.calls(_module(script), CLASS):
+        given = {each.arg for each in call.keywords}
+        several = None in given or any(isinstance(each, ast.Starred) for each in call.args)
+        if absent := [each for each in needed[len(call.args) :] if each not in given]:
+            return "" if several else absent[0]
+    return ""
 
 
 def _networks(repo: HostRepo, script: str) -> set[str]:
@@ -560,6 +578,8 @@ def _read_draws(fork: Fork) -> None:
         if more == named:
             break
         named = more
+    trees = [*fork.trees.values(), *filter(None, bodies)]
+    called = {getattr(n, "id", getattr(n, "attr", "")) for each in trees for n in nodes(each)}
     for name in reached:
         body = fork.repo.function(RENDERER, name)
         assert body is not None  # it draws
@@ -586,7 +606,7 @@ def _read_draws(fork: Fork) -> None:
             if any(re.search(r"torch\.(zeros|empty)\(", ast.unparse(each)) for each in made):
                 found = f"{ast.unparse(blended or ast.Pass())}, which is empty unless asked for"
                 fork.refuse("rasterizer-call", at, found, "channels of every Gaussian")
-        for node in nodes(body):
+        for node in nodes(body) if name in called else ():
             if isinstance(node, ast.Call) and "means3D" in plain.arguments(node):
                 other = plain.Drawing(fork.repo, RENDERER, body, call=node)
                 for found in (why for why, moves in other.shapes() if not moves):

@@ -4,7 +4,7 @@ from functools import partial
 from types import SimpleNamespace
 
 import pytest
-from miniatures.forks import fork
+from miniatures.forks import RENDER, fork
 
 from fragprune_3dgs_fork import ForkAdapter, Unread
 from fragprune_3dgs_fork.fork import read_fork
@@ -154,6 +154,20 @@ def test_a_value_that_only_an_option_reads_is_not_read_without_it(tmp_path):
     assert errors(fork(tmp_path / "off", off, used, values="image, radii, touched")) == []
     found = errors(fork(tmp_path / "on", on, used, values="image, radii, touched"))
     assert "touched, read in train.py" in found[0]
+
+
+def test_a_drawing_function_that_is_only_imported_may_draw_others(tmp_path):
+    other = RENDER.format(package=PACKAGE, settings="bg=0", values="a, b", arguments="", keys="")
+    other = other.split("\n\n\n")[1].replace("def render(", "def shadow(")
+    other = other.replace("opacities=pc.get_opacity", "opacities=pc.net(1)")
+    named = "import render\n", "import render, shadow\n"
+    fork(tmp_path, named)
+    renderer = tmp_path / "gaussian_renderer/__init__.py"
+    renderer.write_text(f"{renderer.read_text()}\n\n{other}")
+    assert errors(HostRepo(tmp_path)) == []
+    script = tmp_path / "train.py"
+    script.write_text(script.read_text() + "\nshadow(view, gaussians, pipe, background)\n")
+    assert "makes opacities from pc.net" in errors(HostRepo(tmp_path))[0]
 
 
 def test_a_value_that_no_proof_can_tell_is_refused(tmp_path):
@@ -592,6 +606,11 @@ REFUSED = {
         {},
         [("\ndef read_flags", "\ntraining(opt, 0)\ntraining(opt, 1)\n\ndef read_flags")],
         "several calls of training",
+    ),
+    "a call of the model that fails": (
+        {},
+        [("def __init__(self, sh_degree)", "def __init__(self, sh_degree, device, rate=1)")],
+        "its call of GaussianModel lacks device",
     ),
     "a training of each scene": (
         {},
