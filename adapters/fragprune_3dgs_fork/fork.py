@@ -527,6 +527,9 @@ def _read_changes(fork: Fork) -> None:
             elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("optimizer.step"):
                 name = ast.unparse(node.func).removesuffix(".step")
                 owner = name.rpartition(".")[0]
+                if len(node.args) == 1:  # two are those of a sparse Adam
+                    at, found = fork.repo.at(_module(script), node.lineno), ast.unparse(node)[:60]
+                    fork.refuse("optimizer", at, f"another optimizer, {found}", "step()")
                 if _MODELS.search(owner) or owner.split("[")[0] in {"", *owners}:
                     continue
             else:

@@ -141,6 +141,8 @@ def returns(getter: Function, stored: str, unset: Collection[str] = ()) -> set[s
     known: dict[str, str] = {}
 
     def state(value: ast.expr | None) -> str:
+        if isinstance(value, ast.IfExp) and (gone := _skipped(value, unset)):
+            return state(value.orelse if value.body in gone else value.body)
         while isinstance(value, ast.Call) and getattr(value.func, "attr", "") in shapes:
             value = value.func.value  # type: ignore[attr-defined]
         if isinstance(value, ast.Call) and len(value.args) == 1 and not value.keywords:
@@ -150,14 +152,9 @@ def returns(getter: Function, stored: str, unset: Collection[str] = ()) -> set[s
             return known.get(value.id, "computed")
         return "stored" if value and ast.unparse(value) == f"self.{stored}" else "computed"
 
-    off = {f"self.{each} is not None" for each in unset}
-    skipped = {
-        id(inner)
-        for node in nodes(getter)
-        if isinstance(node, ast.If) and ast.unparse(node.test) in off
-        for each in node.body
-        for inner in nodes(each)
-    }
+    branches = [node for node in nodes(getter) if isinstance(node, ast.If)]
+    gone = (each for node in branches for each in _skipped(node, unset))
+    skipped = {id(inner) for each in gone for inner in nodes(each)}
     for statement in getter.body:
         for node in (each for each in nodes(statement) if id(each) not in skipped):
             if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
@@ -166,6 +163,30 @@ def returns(getter: Function, stored: str, unset: Collection[str] = ()) -> set[s
                 known[name] = "computed" if branch and made != known[name] else made
     body = [node for node in nodes(getter) if id(node) not in skipped]
     return {state(node.value) for node in body if isinstance(node, ast.Return)}
+
+
+def _skipped(node: ast.If | ast.IfExp, unset: Collection[str]) -> list[ast.AST]:
+    """The branch that is not taken where attributes are None or False; [] if that is not read."""
+    asked = re.fullmatch(r"(not )?self\.([\w.]+)( is not None)?", ast.unparse(node.test))
+    if asked is None or asked[2] not in unset:
+        return []
+    branch = node.orelse if asked[1] else node.body
+    return [*branch] if isinstance(branch, list) else [branch]
+
+
+def options(repo: HostRepo, module: str, model: str) -> set[str]:
+    """What getters ask for that an option of its name, off by default, alone switches on."""
+    getters = (repo.function(module, f"{model}.get_{kind}") for kind in GETTERS)
+    tests = [n.test for each in getters for n in nodes(each) if isinstance(n, ast.If | ast.IfExp)]
+    asked = {n.removeprefix("not ").removeprefix("self.") for n in map(ast.unparse, tests)}
+    made = {
+        ast.unparse(node.targets[0]).removeprefix("self.")
+        for node in nodes(repo.tree(module))
+        if isinstance(node, ast.Assign) and not is_off(node.value)
+        if ast.unparse(node.value).split(".")[-1] != ast.unparse(node.targets[0]).split(".")[-1]
+    }
+    values = {each: [*defaults(repo, "arguments", each.split(".")[-1])] for each in asked - made}
+    return {each for each, given in values.items() if given and all(map(is_off, given))}
 
 
 def training_scripts(repo: HostRepo, *patterns: str) -> tuple[str, ...]:

@@ -607,6 +607,11 @@ REFUSED = {
         [("\ndef read_flags", "\ntraining(opt, 0)\ntraining(opt, 1)\n\ndef read_flags")],
         "several calls of training",
     ),
+    "an optimizer that steps by something": (
+        {},
+        [("gaussians.optimizer.step()", "gaussians.optimizer.step(view.matrix())")],
+        "another optimizer, gaussians.optimizer.step(view.matrix())",
+    ),
     "a call of the model that fails": (
         {},
         [("def __init__(self, sh_degree)", "def __init__(self, sh_degree, device, rate=1)")],

@@ -326,6 +326,28 @@ def test_a_method_that_gives_getters_alone_is_plain(fork, value):
     assert ("makes opacities from pc.get_shapes" in str(reasons)) == ("rain" in value)
 
 
+@pytest.mark.parametrize("asked", ["self.round", "self.args.round"])
+def test_a_getter_may_compute_under_an_option_that_is_off(fork, tmp_path, asked):
+    plain = "self.scaling_activation(self._scaling)"
+    made = f"{plain} if not {asked} else {plain}[:, :1].repeat(1, 3)"
+    changes = (
+        (f"return {plain}", f"return {made}"),
+        (
+            "    def save_ply",
+            "    def create(self, round):\n        self.round = round\n\n    def save_ply",
+        ),
+    )
+    repo = fork(*changes)
+    assert "get_scaling is computed" in read_plain(repo).reasons[0]
+    groups = tmp_path / "arguments/__init__.py"
+    groups.write_text("class Params:\n    def __init__(self):\n        self.round = False\n")
+    verdict = judged(HostRepo(tmp_path))
+    assert verdict.kind == "finetune"
+    assert "get_scaling is computed" in str(verdict.differs)
+    groups.write_text(groups.read_text().replace("False", "True"))
+    assert "get_scaling is computed" in read_plain(HostRepo(tmp_path)).reasons[0]
+
+
 def test_what_is_never_saved_or_drawn_is_not_plain(fork, tmp_path):
     repo = fork()
     script = tmp_path / "train.py"
