@@ -277,6 +277,10 @@ def _check_script(fork: Fork, script: str) -> None:
     fork.one_run = fork.one_run or _not_resumed(fork.repo, script, tree)
 
 
+def _is_loop(node: ast.AST) -> bool:
+    return isinstance(node, ast.For | ast.While)
+
+
 def _trainings(repo: HostRepo, module: str) -> tuple[str, str] | None:
     """What goes backward more than once in one pass of a script, and what is expected.
 
@@ -284,7 +288,7 @@ def _trainings(repo: HostRepo, module: str) -> tuple[str, str] | None:
     """
     body = getattr(repo.tree(module), "body", ())
     functions = {each.name: each for each in body if isinstance(each, ast.FunctionDef)}
-    training, several = dict[str, int](), list[str]()
+    training, several = set[str](), list[str]()
 
     def passes(node: ast.AST, looped: bool = False) -> int:
         if isinstance(node, ast.If):
@@ -292,14 +296,14 @@ def _trainings(repo: HostRepo, module: str) -> tuple[str, str] | None:
         own = 0
         if isinstance(node, ast.Call):
             called = getattr(node.func, "id", "")
-            again = looped and any(isinstance(n, ast.For) for n in nodes(functions.get(called)))
-            several.extend([called] * again * training.get(called, 0))
-            own = training.get(called, 0) * (1 + again)
-            own += getattr(node.func, "attr", "") == "backward"
-        looped |= isinstance(node, ast.For | ast.While)
+            own = (called in training) + (getattr(node.func, "attr", "") == "backward")
+            if called in training and looped and any(map(_is_loop, nodes(functions[called]))):
+                several.append(called)
+                own += 1
+        looped |= _is_loop(node)
         return own + sum(passes(each, looped) for each in ast.iter_child_nodes(node))
 
-    while found := {k: 1 for k, each in functions.items() if k not in training and passes(each)}:
+    while found := {k for k, each in functions.items() if k not in training and passes(each)}:
         training |= found
     main = [each for each in body if each not in functions.values()]
     most = max(sum(map(passes, main)), *map(passes, functions.values()), 0)

@@ -263,7 +263,7 @@ def _of_getters(repo: HostRepo, module: str, name: str) -> Iterator[tuple[str, b
         module, name = "scene.gaussian_model", "GaussianModel"
     off = reading.unset(repo, module, name)
     always = reading.computed_getters(repo, module, name, off)
-    options = reading.options(repo, module, name)
+    options = reading.options(repo, module, name, _training(repo))
     for kind in reading.computed_getters(repo, module, name, options):
         if kind != "xyz" or "self.get_xyz" not in saved:
             at = repo.place(module, f"{name}.get_{kind}")

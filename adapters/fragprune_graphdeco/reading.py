@@ -82,7 +82,8 @@ def unset(repo: HostRepo, module: str, model: str) -> set[str]:
     getters = (repo.function(module, f"{model}.get_{kind}") for kind in GETTERS)
     texts = " ".join(ast.unparse(each) for each in getters if each)
     asked = {each: list(defaults(repo, module, each)) for each in _ASKED.findall(texts)}
-    return {each for each, values in asked.items() if values and all(map(is_off, values))}
+    nothing = {each: {getattr(v, "value", v) for v in values} for each, values in asked.items()}
+    return {each for each, values in nothing.items() if values == {None}}
 
 
 def made_models(repo: HostRepo, module: str) -> list[str]:
@@ -174,19 +175,29 @@ def _skipped(node: ast.If | ast.IfExp, unset: Collection[str]) -> list[ast.AST]:
     return [*branch] if isinstance(branch, list) else [branch]
 
 
-def options(repo: HostRepo, module: str, model: str) -> set[str]:
+def options(repo: HostRepo, module: str, model: str, scripts: Iterable[str]) -> set[str]:
     """What getters ask for that an option of its name, off by default, alone switches on."""
     getters = (repo.function(module, f"{model}.get_{kind}") for kind in GETTERS)
     tests = [n.test for each in getters for n in nodes(each) if isinstance(n, ast.If | ast.IfExp)]
     asked = {n.removeprefix("not ").removeprefix("self.") for n in map(ast.unparse, tests)}
+    assigned = [
+        (ast.unparse(node.targets[0]).split(".")[-1], node.value)
+        for each in (module, *scripts)
+        for node in nodes(repo.tree(each))
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Attribute)
+    ]
     made = {
-        ast.unparse(node.targets[0]).removeprefix("self.")
-        for node in nodes(repo.tree(module))
-        if isinstance(node, ast.Assign) and not is_off(node.value)
-        if ast.unparse(node.value).split(".")[-1] != ast.unparse(node.targets[0]).split(".")[-1]
+        name
+        for name, value in assigned
+        if not is_off(value) and ast.unparse(value).split(".")[-1] != name
     }
-    values = {each: [*defaults(repo, "arguments", each.split(".")[-1])] for each in asked - made}
-    return {each for each, given in values.items() if given and all(map(is_off, given))}
+    names = {each: each.split(".")[-1] for each in asked}
+    values = {k: [*defaults(repo, "arguments", each)] for k, each in names.items()}
+    return {
+        each
+        for each, given in values.items()
+        if given and all(map(is_off, given)) and names[each] not in made
+    }
 
 
 def training_scripts(repo: HostRepo, *patterns: str) -> tuple[str, ...]:

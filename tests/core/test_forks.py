@@ -414,18 +414,18 @@ GETTER = "        if self._new is not None:\n            return self._new\n{}"
 SETS = "    def warp(self):\n        self._new = self.net()\n\n    def capture"
 
 
-@pytest.mark.parametrize("called", [False, True])
+@pytest.mark.parametrize(("called", "first"), [(False, None), (True, None), (False, False)])
 @pytest.mark.parametrize("value", ["self._xyz", "self.opacity_activation(self._opacity)"])
-def test_values_may_be_others_where_no_script_sets_them(tmp_path, value, called):
+def test_values_may_be_others_where_no_script_sets_them(tmp_path, value, called, first):
     returned = f"        return {value}\n"
     repo = fork(
         tmp_path,
         (returned, GETTER.format(returned)),
-        ("sh_degree): ...", "sh_degree):\n        self._new = None"),
+        ("sh_degree): ...", f"sh_degree):\n        self._new = {first}"),
         ("    def capture", SETS),
         (STATEMENT, "gaussians.warp()" if called else STATEMENT),
     )
-    assert ("computed" in str(errors(repo))) == called
+    assert ("computed" in str(errors(repo))) == (called or first is not None)
 
 
 @pytest.mark.parametrize("name", ["gaussian_renderer/__init__.py", "train.py"])

@@ -344,6 +344,11 @@ def test_a_getter_may_compute_under_an_option_that_is_off(fork, tmp_path, asked)
     verdict = judged(HostRepo(tmp_path))
     assert verdict.kind == "finetune"
     assert "get_scaling is computed" in str(verdict.differs)
+    script = tmp_path / "train.py"
+    script.write_text(f"{script.read_text()}\n{asked.replace('self', 'gaussians')} = True\n")
+    assert "get_scaling is computed" in read_plain(HostRepo(tmp_path)).reasons[0]
+    script.write_text(script.read_text().replace(" = True", " = False"))
+    assert judged(HostRepo(tmp_path)).kind == "finetune"
     groups.write_text(groups.read_text().replace("False", "True"))
     assert "get_scaling is computed" in read_plain(HostRepo(tmp_path)).reasons[0]
 
