@@ -1,13 +1,10 @@
-"""Which Gaussians can go: those worth least to the pictures, and those that reach no pixel.
-
-A score gives one number for each Gaussian, the larger the more it is worth: a function of the N
-Gaussians, their thresholds, the views and an engine. ``best`` chooses the Gaussians to keep.
-"""
+"""Which Gaussians can go: those worth least to the pictures, and those that reach no pixel."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -21,8 +18,8 @@ from fragprune_plugins.plugins.hooks import engine_for
 from fragprune_plugins.types import RasterInputs, View
 from fragprune_plugins.workbench.scenes.dataset import Shot
 
-Score = Callable[[Model, Tensor | None, Iterable[View], Engine], Tensor]
-"""Gives (N,) from N Gaussians, their thresholds (N,) in falloff or None, views, and an engine."""
+Keep = float | Literal["auto", "visible"]
+"""The Gaussians to keep (``--keep``): a share of them, or a rule."""
 
 SPARE = 0.005
 """Share of the squared error up to which ``keep_needed`` removes.
@@ -32,31 +29,76 @@ and 30 % of the Gaussians of three scenes went for 0.03 dB or less.
 """
 
 
+def kept(
+    model: Model,
+    keep: Keep,
+    shots: Sequence[Shot],
+    views: Sequence[View],
+    *,
+    engine: str | Engine = "auto",
+    progress: bool = False,
+) -> Tensor:
+    """(N,) bool: the Gaussians that ``--keep`` leaves of N.
+
+    Args:
+        model: N Gaussians and their thresholds.
+        keep: a share of them in (0, 1]; "auto" for what ``keep_needed`` leaves, or "visible".
+        shots: the photographs to learn from, on the model's device.
+        views: whose pictures must not change.
+        engine: a name or an engine.
+        progress: draw a bar on stderr.
+
+    Raises:
+        InputError: the share is not in (0, 1], or no Gaussian is visible.
+    """
+    drawer = engine_for(engine, model.device)
+    if keep == "visible":
+        return visible(model, views, engine=drawer)
+    scores = removal_error(model, model.falloff, _bar(views, progress), drawer)
+    if keep != "auto":
+        return best(scores, keep)
+    spared = SPARE * _error(model, shots, drawer) * len(views) / len(shots)
+    each, least = scores.double().sort(stable=True)
+    goes = int((each.cumsum(0) <= spared).sum())
+    stays = torch.ones_like(each, dtype=torch.bool)
+    stays[least[: min(goes, len(each) - 1)]] = False
+    return stays
+
+
+@torch.no_grad()
+def _error(model: Model, shots: Iterable[Shot], engine: Engine) -> float:
+    """Squared error of a model in all photographs."""
+    splats, error = model.splats(), 0.0
+    for shot in shots:
+        inputs = RasterInputs(shot.view, splats, planes=(), **model.rules)
+        image = engine.rasterize(inputs, model.falloff).image
+        error += float((shot.looked_at(image).clamp(0, 1) - shot.image).square().sum())
+    return error
+
+
 def keep_best(
     model: Model,
     share: float,
     views: Sequence[View],
     *,
-    score: Score | None = None,
     engine: str | Engine = "auto",
     progress: bool = False,
 ) -> Model:
-    """Copy a model without the Gaussians of the lowest score. Thresholds keep their moments.
+    """Copy a model without the Gaussians of the least ``removal_error``.
+
+    Thresholds keep their moments.
 
     Args:
         model: N Gaussians and their thresholds.
         share: of the Gaussians to keep, in (0, 1]; at least one is kept.
         views: to score them on, on the model's device.
-        score: gives the numbers; ``removal_error`` when None.
         engine: a name or an engine.
         progress: draw a bar on stderr.
 
     Raises:
         InputError: the share is not in (0, 1].
     """
-    score, drawer = score or removal_error, engine_for(engine, model.device)
-    scores = score(model, model.falloff, _bar(views, progress), drawer)
-    return model.keep(best(scores, share))
+    return model.keep(kept(model, share, (), views, engine=engine, progress=progress))
 
 
 def keep_needed(
@@ -79,20 +121,8 @@ def keep_needed(
         engine: a name or an engine.
         progress: draw a bar on stderr.
     """
-    thresholds = model.falloff
-    drawer, splats, error = engine_for(engine, model.device), model.splats(), 0.0
-    with torch.no_grad():
-        for shot in shots:
-            inputs = RasterInputs(shot.view, splats, planes=(), **model.rules)
-            image = drawer.rasterize(inputs, thresholds).image
-            error += float((shot.looked_at(image).clamp(0, 1) - shot.image).square().sum())
     views = views or [shot.view for shot in shots]
-    scores = removal_error(model, thresholds, _bar(views, progress), drawer)
-    each, least = scores.double().sort(stable=True)
-    spared = int((each.cumsum(0) <= SPARE * error * len(views) / len(shots)).sum())
-    kept = torch.ones_like(each, dtype=torch.bool)
-    kept[least[: min(spared, len(each) - 1)]] = False
-    return model.keep(kept)
+    return model.keep(kept(model, "auto", shots, views, engine=engine, progress=progress))
 
 
 def best(scores: Tensor, share: float) -> Tensor:

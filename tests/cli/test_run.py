@@ -213,7 +213,7 @@ def test_a_model_that_knows_its_photographs_by_heart_is_told_and_learns_otherwis
     assert (asked["gaussians"], asked["keep"], asked["forgotten"]) == (whole, None, None)
 
 
-@pytest.mark.parametrize("where", [(trial, "forgotten"), (work, "removal_error")])
+@pytest.mark.parametrize("where", [(trial, "forgotten"), (work, "kept")])
 def test_where_a_look_fails_stage_two_learns_as_asked(scene, tmp_path, monkeypatch, caplog, where):
     def fail(*_, **__):
         raise ModelFileError("out", "a stand-in", "something else", "Nothing.")

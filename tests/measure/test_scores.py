@@ -109,14 +109,6 @@ def test_thresholds_and_moments_stay_with_their_rows():
     assert all(torch.equal(each, expected[k]) for k, each in tiny.state(smaller).items())
 
 
-def test_a_model_without_thresholds_is_pruned_by_the_score_that_is_asked_for():
-    model, _ = scene(False)
-    smaller = scores.keep_best(model, 0.3, VIEWS, score=lambda *_: model.splats().opacities)
-    assert smaller.thresholds is None
-    faintest = model.opacity[:, 0].sort(descending=True).values[int(0.3 * COUNT) - 1]
-    assert torch.equal(smaller.opacity, model.opacity[model.opacity[:, 0] >= faintest])
-
-
 def test_what_can_be_spared_costs_no_more_than_its_share_of_the_error(tmp_path):
     truth = tiny.random_model()
     model, shots = tiny.perturbed(truth), tiny.dataset_in_memory(tmp_path, truth).train

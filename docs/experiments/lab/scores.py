@@ -11,7 +11,13 @@ from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.fragments import fragments
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.types import RasterInputs, RasterOutputs, View
-from fragprune_plugins.workbench.pruning import Score, removal_error
+from fragprune_plugins.workbench.pruning import removal_error
+
+Score = Callable[[Model, Tensor | None, Iterable[View], Engine], Tensor]
+"""Gives (N,) from N Gaussians, their thresholds (N,) in falloff or None, views, and an engine.
+
+The larger the number, the more the Gaussian is worth.
+"""
 
 VOLUME_POWER = 0.1
 """LightGaussian's exponent of a Gaussian's volume (``v_pow``)."""

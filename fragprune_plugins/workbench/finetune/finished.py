@@ -20,9 +20,10 @@ from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
 from fragprune_plugins.workbench.figures.recorded import Recorded
 from fragprune_plugins.workbench.finetune.loop import FinetuneResult
 from fragprune_plugins.workbench.finetune.searching import Bounded
-from fragprune_plugins.workbench.finetune.trial import DROPOUT, KEEP, Keep
+from fragprune_plugins.workbench.finetune.trial import DROPOUT, KEEP
 from fragprune_plugins.workbench.models import formats
 from fragprune_plugins.workbench.models.model import describe_written
+from fragprune_plugins.workbench.pruning import Keep
 from fragprune_plugins.workbench.scenes.dataset import Dataset
 
 LOST = 0.05
@@ -41,7 +42,7 @@ class Asked:
     cameras: Path | None
     scene: SceneOptions
     settings: Settings
-    keep: Keep
+    keep: Keep | None
     seed: int
     shard: bool
     no_truncation: bool
@@ -256,7 +257,7 @@ def advise(data: dict[str, Any]) -> str | None:
     if not (photographs and learned) or data["after"]["psnr"] > data["before"]["psnr"] - LOST:
         return None
     more = [] if data["settings"]["dropout"] else [f"--dropout {DROPOUT:g}"]
-    more += [f"--keep {KEEP:g}"] if data["keep"] is None else []
+    more += [f"--keep {KEEP:g}"] if data["keep"] in (None, "auto") else []
     if not more:
         return None
     return f"MODEL as it came shows the held-out views better: {' '.join(more)} may lose less."

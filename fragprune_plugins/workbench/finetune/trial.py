@@ -5,7 +5,6 @@ from __future__ import annotations
 import statistics
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.files.model import Model
@@ -17,6 +16,7 @@ from fragprune_plugins.workbench.finetune.loop import Training
 from fragprune_plugins.workbench.finetune.processes import Processes
 from fragprune_plugins.workbench.finetune.resuming import Keeper
 from fragprune_plugins.workbench.goals import AtMost, Faster
+from fragprune_plugins.workbench.pruning import Keep
 from fragprune_plugins.workbench.ranks import Ranks
 from fragprune_plugins.workbench.scenes.dataset import Dataset
 
@@ -25,9 +25,6 @@ DROPOUT, KEEP = 0.2, 0.6
 
 BY_HEART = 0.2
 """dB that a model forgets in a trial if it knows its photographs by heart; others 0.05 at most."""
-
-Keep = float | Literal["auto", "visible"] | None
-"""The Gaussians that a training begins with: a share, a rule (``--keep``), or all."""
 
 STEPS = 100
 _VIEWS = 24  # to measure on
@@ -40,12 +37,12 @@ class Trial:
 
     Attributes:
         settings: to learn with.
-        keep: the Gaussians to begin with.
+        keep: the Gaussians to begin with; all if None.
         forgotten: what the trial found, see ``forgotten``; None without one.
     """
 
     settings: Settings
-    keep: Keep = None
+    keep: Keep | None = None
     forgotten: float | None = None
 
 
@@ -53,16 +50,16 @@ def tried(
     model: Model,
     dataset: Dataset,
     settings: Settings,
-    keep: Keep = None,
+    keep: Keep | None = None,
     *,
     engine: Engine,
     say: Callable[[str], None],
 ) -> Trial:
     """Make a trial where nobody chose a dropout, and choose what suits a model of its kind.
 
-    One that knows its photographs by heart learns with dropout, and without four in ten Gaussians
-    unless somebody chose which: but with all that it has if it was pruned before, or if a target is
-    a ratio to what it began with.
+    One that knows its photographs by heart learns with dropout, and without four in ten Gaussians;
+    another without those that its photographs can spare. Unless somebody chose which: but with all
+    that it has if it was pruned before, or if a target is a ratio to what it began with.
 
     Args:
         model: not changed.
@@ -77,15 +74,15 @@ def tried(
     lost = forgotten(model, dataset, engine=engine, seed=settings.seed, say=say)
     if lost is None:
         return asked
-    told = f"they change the others by {-lost:+.2f} dB"
-    if lost < BY_HEART:
-        say(f"{told}: it does not")
-        return replace(asked, forgotten=lost)
+    by_heart = lost >= BY_HEART
     whole = model.falloff is None and not isinstance(settings.goal, Fewer | Faster)
-    keep = KEEP if keep is None and whole else keep
-    options = f"--dropout {DROPOUT:g}" + (f" --keep {keep}" if keep else "")
-    say(f"{told}: it does, so {options}")
-    return Trial(replace(settings, dropout=DROPOUT), keep, lost)
+    if keep is None and whole:
+        keep = KEEP if by_heart else "auto"
+    options = [f"--dropout {DROPOUT:g}"] * by_heart + [f"--keep {keep}"] * (keep is not None)
+    told = f"they change the others by {-lost:+.2f} dB: it does" + ("" if by_heart else " not")
+    say(f"{told}, so {' '.join(options)}" if options else told)
+    dropout = DROPOUT if by_heart else None
+    return Trial(replace(settings, dropout=dropout), keep, lost)
 
 
 def forgotten(

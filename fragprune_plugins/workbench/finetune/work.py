@@ -29,7 +29,7 @@ from fragprune_plugins.workbench.finetune.trial import tried
 from fragprune_plugins.workbench.goals import AtMost
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.models.model import require_place
-from fragprune_plugins.workbench.pruning import keep_best, keep_needed, visible
+from fragprune_plugins.workbench.pruning import kept
 from fragprune_plugins.workbench.ranks import Ranks, joined, launched
 from fragprune_plugins.workbench.scenes.dataset import Dataset, load_photographs
 from fragprune_plugins.workbench.scenes.generated import views_near
@@ -135,8 +135,8 @@ def _learned(opened: _Opened, ranks: Ranks, lost: float | None) -> tuple[Finetun
     if asked.shard:
         whole, engine = part_of(whole, ranks, opened.device), ShardedEngine(engine, ranks)
     start = Candidate(whole, gaussians=count)
-    kept = _keep(whole, asked, opened.dataset.to(opened.device), engine)
-    result, found = _learn(kept, opened, engine, ranks)
+    left = _keep(whole, asked, opened.dataset.to(opened.device), engine)
+    result, found = _learn(left, opened, engine, ranks)
     saved = whole_of(result.model, ranks) if asked.shard else result.model
     if ranks.first:
         models.save(asked.out, saved)
@@ -145,7 +145,7 @@ def _learned(opened: _Opened, ranks: Ranks, lost: float | None) -> tuple[Finetun
         start,
         result,
         forgotten=lost,
-        removed=len(whole) - len(kept),
+        removed=len(whole) - len(left),
         found=found,
         truncated=ranks.gather(saved.falloff is not None)[0],
         shards=ranks.size if asked.shard else 1,
@@ -169,15 +169,14 @@ def _keep(whole: Model, asked: Asked, dataset: Dataset, engine: Engine) -> Model
     """The Gaussians that --keep leaves, for what training views and cameras beside them show."""
     if asked.keep is None:
         return whole
-    if asked.keep == "visible":
-        views = [shot.view for shot in (*dataset.train, *dataset.test)]
-        return whole.keep(visible(whole, views, engine=engine))
     shots = dataset.train
-    between = asked.itself  # own pictures lie between all cameras already
-    views = [shot.view for shot in shots] if between else views_near(shots, seed=asked.seed)
-    if asked.keep == "auto":
-        return keep_needed(whole, shots, views, engine=engine, progress=True)
-    return keep_best(whole, asked.keep, views, engine=engine, progress=True)
+    if asked.keep == "visible":
+        views = [shot.view for shot in (*shots, *dataset.test)]
+    elif asked.itself:  # own pictures lie between all cameras already
+        views = [shot.view for shot in shots]
+    else:
+        views = views_near(shots, seed=asked.seed)
+    return whole.keep(kept(whole, asked.keep, shots, views, engine=engine, progress=True))
 
 
 def _learn(

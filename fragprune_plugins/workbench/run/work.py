@@ -30,7 +30,7 @@ from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
 from fragprune_plugins.workbench.figures.recorded import Recorded
 from fragprune_plugins.workbench.finetune.trial import Trial, tried
 from fragprune_plugins.workbench.models.model import load
-from fragprune_plugins.workbench.pruning import best, removal_error
+from fragprune_plugins.workbench.pruning import kept
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
 from fragprune_plugins.workbench.scenes.generated import views_near
 
@@ -239,9 +239,10 @@ class Looking:
     ) -> tuple[Settings, Tensor | None]:
         engine, device = open_engine(self.engine)
         model, dataset = load(ply, device=device), load_photographs(photographs).to(device)
-        trial, kept = tried(model, dataset, settings, engine=engine, say=log.info), None
-        if isinstance(trial.keep, float):
-            views = views_near(dataset.train, seed=settings.seed)
-            kept = best(removal_error(model, model.falloff, views, engine), trial.keep).cpu()
+        trial, left = tried(model, dataset, settings, engine=engine, say=log.info), None
+        if trial.keep is not None:
+            shots = dataset.train
+            views = views_near(shots, seed=settings.seed)
+            left = kept(model, trial.keep, shots, views, engine=engine).cpu()
         self.trial = trial
-        return trial.settings, kept
+        return trial.settings, left
