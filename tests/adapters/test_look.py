@@ -18,17 +18,22 @@ from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.injection.launch import run
 from fragprune_plugins.injection.starting import part_of
 from fragprune_plugins.learning.goals import Control
+from fragprune_plugins.workbench.models.model import load
 
 ENDED = ("--densify_until_iter", 8)
 """Before the last iteration, as in every training that ends."""
 
 RESUMED = {
-    "vanilla-3dgs": ENDED,
-    "3dgs-fork": ENDED,
-    "mcmc": (*ENDED, "--cap_max", 170),
-    "speedy-splat": (*ENDED, "--prune_until_iter", 0),
+    "3dgs-fork": ("train_scene.py",),
+    "light-gaussian": ("train_densify_prune.py", "--prune_iterations", 9),
+    "lp-3dgs": ("train.py",),
+    "mcmc": ("train.py", "--cap_max", 170),
+    "mini-splatting": ("ms/train.py", "--imp_metric", "indoor", "--simp_iteration1", 8),
+    "rain-gs": ("train.py",),
+    "speedy-splat": ("train.py", "--prune_until_iter", 0),
+    "vanilla-3dgs": ("train.py",),
 }
-"""Hosts, and words that their commands need besides."""
+"""Hosts whose models are looked at, with the script and what its command needs besides."""
 
 
 class Looked:
@@ -39,7 +44,7 @@ class Looked:
 
     def __call__(self, ply, photographs, settings):
         self.seen.append((ply, photographs, settings))
-        kept = torch.arange(len(read_ply(ply).xyz)) % 2 == 0
+        kept = torch.arange(len(load(ply))) % 2 == 0
         return replace(settings, dropout=0.25), kept
 
 
@@ -64,11 +69,11 @@ def trained(stage_one, tmp_path):
 @pytest.mark.parametrize("host", RESUMED)
 def test_stage_two_begins_with_the_gaussians_that_are_kept(host, photographs, tmp_path):
     folder, look = runs.written(HOSTS[host], tmp_path / "host"), Looked()
-    (script,) = folder.glob("train*.py")
-    words = runs.command(script, photographs, tmp_path / "out", 10, *RESUMED[host])
+    script, *more = RESUMED[host]
+    words = runs.command(folder / script, photographs, tmp_path / "out", 10, *ENDED, *more)
     summary = run(words, replace(OPTIONS, look=look))
     assert [seen[0] for seen in look.seen] == [summary.model_before]
-    before, after = read_ply(summary.model_before), read_ply(summary.model_after)
+    before, after = load(summary.model_before), load(summary.model_after)
     for name in FROZEN:
         assert torch.equal(getattr(after, name), getattr(before, name)[::2]), name
     store, info = sidecar.load(summary.model_after)
