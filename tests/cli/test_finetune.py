@@ -163,6 +163,16 @@ def test_what_shows_beside_the_photographs_stays(scene, words, out):
     assert not torch.equal(alone.xyz, fp.keep_best(model, 0.7, views).xyz)
 
 
+def test_photographs_of_another_scene_are_told_before_the_learning(scene, words):
+    _, path, model = scene
+    assert "another scene" not in run(*words, 3).stderr
+    model.f_dc.fill_(-99)
+    write_ply(path, model)
+    told = run(*words, 3).stderr
+    assert "warning: MODEL shows its photographs at" in told
+    assert "--white-background" in told
+
+
 def test_what_a_model_itself_can_spare_is_not_known(words):
     fails(*words, 3, "--self", "--keep", "auto", says="--keep auto")
     report = run_json(*words, 3, "--self", "--keep", 0.9)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -14,11 +15,12 @@ from fragprune_plugins.files.atomic import locked
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.learning.interruption import sigterm_interrupts
+from fragprune_plugins.learning.stage2 import evenly
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import OwnCameras, open_engine, photographs_for
 from fragprune_plugins.workbench.commands.options import require_several
 from fragprune_plugins.workbench.distributed import ShardedEngine, part_of, whole_of
-from fragprune_plugins.workbench.figures.evaluate import Candidate
+from fragprune_plugins.workbench.figures.evaluate import Candidate, psnrs
 from fragprune_plugins.workbench.finetune import api, resuming
 from fragprune_plugins.workbench.finetune import finished as finetuned
 from fragprune_plugins.workbench.finetune.finished import Asked, Finetuned
@@ -35,6 +37,12 @@ from fragprune_plugins.workbench.scenes.dataset import Dataset, load_photographs
 from fragprune_plugins.workbench.scenes.generated import views_near
 
 _say = partial(click.echo, err=True)
+
+OTHER_SCENE = 12.0
+"""dB of PSNR below which photographs are those of another scene, or over another background.
+
+A grey picture reaches about as much; a model of 100 iterations more.
+"""
 
 
 @dataclass(frozen=True)
@@ -123,9 +131,21 @@ def _tried(opened: _Opened) -> tuple[_Opened, float | None]:
     if launched().size > 1:
         return opened, None
     asked, dataset = opened.asked, opened.dataset.to(opened.device)
+    _warn_of_another_scene(opened, dataset)
     trial = tried(opened.whole, dataset, asked.settings, asked.keep, engine=opened.engine, say=_say)
     asked = replace(asked, settings=trial.settings, keep=trial.keep)
     return replace(opened, asked=asked), trial.forgotten
+
+
+def _warn_of_another_scene(opened: _Opened, dataset: Dataset) -> None:
+    """Warn before the learning of photographs that the model does not show."""
+    shots = evenly(dataset.train, 8)
+    shown = statistics.fmean(psnrs(Candidate(opened.whole), shots, opened.engine)[0])
+    if shown < OTHER_SCENE:
+        _say(
+            f"warning: MODEL shows its photographs at {shown:.1f} dB PSNR, as if they were of "
+            "another scene. Check --data, --images, --resolution and --white-background."
+        )
 
 
 def _learned(opened: _Opened, ranks: Ranks, lost: float | None) -> tuple[Finetuned, Engine]:
