@@ -56,6 +56,20 @@ def test_options_override_the_training(output):
     fails("profile", output, "--images", "images_2", says="images_2", code=1)
 
 
+@pytest.mark.parametrize("white", [True, False])
+def test_beside_data_the_training_says_whether_it_drew_over_white(tmp_path, white):
+    data, _, model = tiny.scene(tmp_path)
+    known = write_output(tmp_path / "out", data, model, white_background=white)
+    alone = write_output(tmp_path / "alone", data, model)
+    asked = run_json("profile", known, "--data", data)
+    told = ("--white-background",) if white else ()
+    for figures in (asked, run_json("compare", known, known, "--data", data)["a"]):
+        expected = run_json("profile", alone, "--data", data, *told)
+        assert figures["psnr"] == expected["psnr"]
+    (known / "cfg_args").write_text("not to be read")
+    assert run_json("profile", known, "--data", data)["views"] == 2
+
+
 def test_render_takes_the_trainings_cameras(output, tmp_path):
     report = run_json("render", output, "--out", tmp_path / "pictures")
     (file,) = report["files"]

@@ -26,6 +26,7 @@ from fragprune_plugins.workbench.scenes.output import (
     ARGUMENTS,
     CAMERAS,
     output_folder,
+    over_white,
     trained_on,
 )
 
@@ -64,15 +65,16 @@ def photographs_for(
 ) -> Photographs:
     """The photographs that the options name; without --data those that the model was trained on.
 
-    Options that were given override what the training says.
+    Options that were given override what the training says. Beside --data it still says whether
+    the model was drawn over white.
 
     Raises:
         UsageError: there is no folder, and the model lies in no output folder with arguments.
         DatasetError: the training's arguments cannot be read.
     """
     if scene.data is not None:
-        size = Resolution(scene.resolution)
-        return Photographs(scene.data, size, scene.white_background, scene.images)
+        size, white = Resolution(scene.resolution), scene.white_background or over_white(model)
+        return Photographs(scene.data, size, white, scene.images)
     trained = trained_on(model)
     if trained is None:
         raise UsageError(

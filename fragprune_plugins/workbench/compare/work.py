@@ -24,7 +24,7 @@ from fragprune_plugins.workbench.figures.pictures import leave_panels
 from fragprune_plugins.workbench.figures.recorded import Recorded, recorded
 from fragprune_plugins.workbench.models.model import load, writable_folder
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
-from fragprune_plugins.workbench.scenes.output import trained_on
+from fragprune_plugins.workbench.scenes.output import over_white, trained_on
 
 
 def compare(
@@ -141,4 +141,5 @@ def _photographs(scene: SceneOptions, known: dict[Path, Recorded], *models: Path
             "a scene folder, or A's own pictures",
             "Name it with --data; without photographs, pass --self.",
         )
-    return overridden(Photographs(scene.data), scene)
+    white = any(map(over_white, models))
+    return overridden(Photographs(scene.data, white_background=white), scene)

@@ -7,6 +7,7 @@ arguments as ``cfg_args``: the text of an ``argparse.Namespace``. Nothing of it 
 from __future__ import annotations
 
 import ast
+import contextlib
 import logging
 import re
 from pathlib import Path
@@ -95,6 +96,14 @@ def trained_on(model: Path) -> Photographs | None:
             printable(str(folder)),
         )
     return photographs
+
+
+def over_white(model: Path) -> bool:
+    """Whether the training of a model, by the arguments in its output folder, drew over white."""
+    with contextlib.suppress(DatasetError):
+        trained = trained_on(model)
+        return trained is not None and trained.white_background
+    return False
 
 
 def _call(text: str) -> ast.Call:
