@@ -49,9 +49,11 @@ _OPTIMIZER = re.compile(r"(torch\.)?(optim\.)?\w*(Adam|SGD|RMSprop)\w*\(")
 _CAMERA = re.compile(r"view|cam")
 _MODEL_ARGUMENTS = ("pc", "gaussians", "gaussian", "model")
 
-NEUTRAL = {"antialiasing", "confidence"}
+NEUTRAL = {"antialiasing", "confidence", "projmatrix_raw"}
 """Further settings that the engines know, or that are checked to be neutral at every call."""
-SERVED = {"dc"}
+POSES = {"theta", "rho"}
+"""Arguments that only get a camera's gradients: how it turns and moves, 0 at every call."""
+SERVED = {"dc", *POSES}
 """Further arguments that the engines know."""
 _SCREEN = re.compile(r"means2D_\w+")
 """Further tensors that get a gradient on the screen, by which Gaussians are densified."""
@@ -89,6 +91,7 @@ class Fork:
         draws: the drawing functions that these reach.
         outputs: by package, what its rasterizer returns.
         still: methods of the model that scripts call, and that change it.
+        answering: those whose result they read, while they densify.
         setups: methods that make the optimizer.
         blended: by package, the argument with channels that are blended beside the colours.
         options: off by default, under which scripts draw by other functions.
@@ -106,6 +109,7 @@ class Fork:
     draws: tuple[Draw, ...] = ()
     outputs: dict[str, tuple[Output, ...]] = field(default_factory=dict)
     still: tuple[str, ...] = ()
+    answering: frozenset[str] = frozenset()
     setups: tuple[str, ...] = ()
     blended: dict[str, str] = field(default_factory=dict)
     options: frozenset[str] = frozenset()
@@ -362,17 +366,22 @@ def rests_after_densification(fork: Fork) -> bool:
     """Whether scripts change the model only where they ask for ``densify_until_iter``."""
     for script in fork.scripts:
         tree = fork.repo.tree(_module(script))
-        inside = {
-            id(inner)
-            for node in nodes(tree)
-            if isinstance(node, ast.If) and "densify_until_iter" in ast.unparse(node.test)
-            for each in node.body
-            for inner in nodes(each)
-        }
+        inside = _while_densifying(tree)
         for node, name in _method_calls(tree) if tree else ():
             if name in fork.still and name != "oneupSHdegree" and id(node) not in inside:
                 return False
     return True
+
+
+def _while_densifying(tree: ast.AST | None) -> set[int]:
+    """What a script does only where it asks for ``densify_until_iter``."""
+    return {
+        id(inner)
+        for node in nodes(tree)
+        if isinstance(node, ast.If) and "densify_until_iter" in ast.unparse(node.test)
+        for each in node.body
+        for inner in nodes(each)
+    }
 
 
 def _in_loop(tree: ast.AST, name: str, inside: bool = False) -> bool:
@@ -436,12 +445,15 @@ def _read_methods(fork: Fork) -> None:
     for module, tree in fork.trees.items():
         owners = _owners(tree)
         statements = {id(each.value) for each in nodes(tree) if isinstance(each, ast.Expr)}
+        early = _while_densifying(tree) if module in map(_module, fork.scripts) else set()
         for node, name in _method_calls(tree):
             if name in changing:
                 called[name] = None
                 owner = ast.unparse(node.func.value)  # type: ignore[attr-defined]
                 own = _MODELS.search(owner) or owner.split("[")[0] in owners
-                if own and id(node) not in statements:
+                if own and id(node) in early - statements:
+                    fork.answering |= {name}
+                elif own and id(node) not in statements:
                     at = fork.repo.at(module, node.lineno)
                     fork.refuse("row-change", at, f"reads what {name} returns", "a statement")
     fork.still = tuple(name for name in methods if name in called)
@@ -507,7 +519,7 @@ def _assigned(body: ast.AST, owner: str = "") -> Iterator[tuple[int, str]]:
             for each in target.elts if isinstance(target, ast.Tuple) else [target]:
                 inner: ast.AST = each
                 while isinstance(inner, ast.Subscript | ast.Attribute):
-                    if isinstance(inner, ast.Attribute) and inner.attr == "grad":
+                    if getattr(inner, "attr", "") in ("grad", "requires_grad"):
                         break
                     if isinstance(inner, ast.Attribute) and inner.attr in PARAMETERS:
                         if not owner or ast.unparse(inner.value) == owner:
@@ -662,6 +674,8 @@ def _check_call(fork: Fork, at: str, function: str, call: graphdeco.CallInSource
     """Settings and arguments besides the known ones: off, or without a part in the picture."""
     if blended := blended_argument(fork.repo, call):
         fork.blended[call.package] = blended
+    if POSES & call.arguments:
+        fork.warn("rasterizer-call", at, "the cameras, which stand still in stage 2")
     screens = frozenset(filter(_SCREEN.fullmatch, call.arguments))
     fork.screens |= screens
     given = call.arguments - SERVED - screens - {blended}
