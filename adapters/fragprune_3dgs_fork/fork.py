@@ -17,6 +17,7 @@ from fragprune_3dgs_fork.rasterizer import (
     meaning,
 )
 from fragprune_graphdeco import kernels, plain, reading
+from fragprune_graphdeco.reading import module_of
 from fragprune_plugins.adapting import (
     Finding,
     Function,
@@ -130,7 +131,7 @@ class Fork:
 
     def is_off(self, name: str) -> bool:
         """Whether an option or an attribute of the model is None or False by default."""
-        modules = ("arguments", MODEL, *map(_module, self.scripts))
+        modules = ("arguments", MODEL, *map(module_of, self.scripts))
         values = [each for m in modules for each in reading.defaults(self.repo, m, name)]
         return bool(values) and all(map(is_off, values))
 
@@ -157,7 +158,7 @@ class Fork:
     @cached_property
     def trees(self) -> dict[str, ast.Module]:
         """The scripts and the checkout's own modules that they import, without model and draws."""
-        seen = reading.reached(self.repo, map(_module, self.scripts), RENDERER)
+        seen = reading.reached(self.repo, map(module_of, self.scripts), RENDERER)
         return {each: tree for each, tree in seen.items() if not _OF_MODELS.search(each)}
 
 
@@ -194,11 +195,6 @@ def _read(repo: HostRepo, scripts: tuple[str, ...]) -> Fork:
     return fork
 
 
-def _module(script: str) -> str:
-    """The module that a script is, of a path below the checkout."""
-    return script.removesuffix(".py").replace("/", ".")
-
-
 # -- scripts ---------------------------------------------------------------------------------------
 
 
@@ -206,10 +202,12 @@ def _read_scripts(fork: Fork, scripts: tuple[str, ...]) -> None:
     """Of these scripts, the training scripts of the model class: they make it once."""
     repo = fork.repo
     for script in scripts:
-        tree = repo.tree(_module(script))
+        tree = repo.tree(module_of(script))
         assert tree is not None  # it is a candidate
         networks = _networks(repo, script)
-        made = [each for each in reading.made_models(repo, _module(script)) if each not in networks]
+        made = [
+            each for each in reading.made_models(repo, module_of(script)) if each not in networks
+        ]
         if CLASS in made and len(set(made)) == 1:
             fork.scripts += (script,)
             if lacking := _lacking(repo, script):
@@ -221,7 +219,9 @@ def _read_scripts(fork: Fork, scripts: tuple[str, ...]) -> None:
             fork.unserved[script] = f"makes {', '.join(dict.fromkeys(made))}"
     if not fork.scripts:
         others = "; ".join(f"{script} {why}" for script, why in fork.unserved.items())
-        found = others or "no script that trains a GaussianModel"
+        names = (each.stem for each in sorted(repo.root.glob("*train*.py")))
+        broken = [f"{each}.py is no valid Python" for each in names if repo.tree(each) is None]
+        found = others or "; ".join(broken) or "no script that trains a GaussianModel"
         fork.refuse("other-host", str(repo.root), found, "a *train*.py that makes GaussianModels")
     for script in fork.scripts:
         _check_script(fork, script)
@@ -234,7 +234,7 @@ def _lacking(repo: HostRepo, script: str) -> str:
         return ""
     own = [each.arg for each in function.args.args[1:]]
     needed = own[: len(own) - len(function.args.defaults)]
-    for call in repo.calls(_module(script), CLASS):
+    for call in repo.calls(module_of(script), CLASS):
         given = {each.arg for each in call.keywords}
         several = None in given or any(isinstance(each, ast.Starred) for each in call.args)
         if absent := [each for each in needed[len(call.args) :] if each not in given]:
@@ -246,7 +246,7 @@ def _networks(repo: HostRepo, script: str) -> set[str]:
     """Classes that a script imports and that save no PLY: they are no models of Gaussians."""
     return {
         node.name
-        for tree in reading.reached(repo, [_module(script)], RENDERER).values()
+        for tree in reading.reached(repo, [module_of(script)], RENDERER).values()
         for node in tree.body
         if isinstance(node, ast.ClassDef)
         and node.name != CLASS
@@ -258,12 +258,12 @@ def _networks(repo: HostRepo, script: str) -> set[str]:
 
 def _check_script(fork: Fork, script: str) -> None:
     """A script trains in this process, and goes backward once in an iteration."""
-    tree = fork.repo.tree(_module(script))
+    tree = fork.repo.tree(module_of(script))
     assert tree is not None  # it is a candidate
     if _PROCESSES.search(ast.unparse(tree)):
         found = "it trains in processes of its own"
         fork.refuse("script", script, found, "one process that keeps its files")
-    if several := _trainings(fork.repo, _module(script)):
+    if several := _trainings(fork.repo, module_of(script)):
         fork.refuse("script", script, *several)
     compared = [node for node in nodes(tree) if isinstance(node, ast.Compare)]
     tests = [ast.unparse(each) for each in compared if isinstance(each.ops[0], ast.In)]
@@ -365,7 +365,7 @@ def _not_resumed(repo: HostRepo, script: str, tree: ast.Module) -> str:
 def rests_after_densification(fork: Fork) -> bool:
     """Whether scripts change the model only where they ask for ``densify_until_iter``."""
     for script in fork.scripts:
-        tree = fork.repo.tree(_module(script))
+        tree = fork.repo.tree(module_of(script))
         inside = _while_densifying(tree)
         for node, name in _method_calls(tree) if tree else ():
             if name in fork.still and name != "oneupSHdegree" and id(node) not in inside:
@@ -445,7 +445,7 @@ def _read_methods(fork: Fork) -> None:
     for module, tree in fork.trees.items():
         owners = _owners(tree)
         statements = {id(each.value) for each in nodes(tree) if isinstance(each, ast.Expr)}
-        early = _while_densifying(tree) if module in map(_module, fork.scripts) else set()
+        early = _while_densifying(tree) if module in map(module_of, fork.scripts) else set()
         for node, name in _method_calls(tree):
             if name in changing:
                 called[name] = None
@@ -535,7 +535,7 @@ def _read_changes(fork: Fork) -> None:
             at = fork.repo.at(module, line)
             fork.refuse("row-change", at, f"changes {name} outside the model's methods", "none")
     for script in fork.scripts:
-        trained = fork.repo.tree(_module(script))
+        trained = fork.repo.tree(module_of(script))
         owners = _owners(trained) if trained else set()
         for node in nodes(trained):
             if isinstance(node, ast.Assign) and _OPTIMIZER.match(ast.unparse(node.value)):
@@ -544,13 +544,13 @@ def _read_changes(fork: Fork) -> None:
                 name = ast.unparse(node.func).removesuffix(".step")
                 owner = name.rpartition(".")[0]
                 if len(node.args) == 1:  # two are those of a sparse Adam
-                    at, found = fork.repo.at(_module(script), node.lineno), ast.unparse(node)[:60]
+                    at, found = fork.repo.at(module_of(script), node.lineno), ast.unparse(node)[:60]
                     fork.refuse("optimizer", at, f"another optimizer, {found}", "step()")
                 if _MODELS.search(owner) or owner.split("[")[0] in {"", *owners}:
                     continue
             else:
                 continue
-            at = fork.repo.at(_module(script), node.lineno)
+            at = fork.repo.at(module_of(script), node.lineno)
             fork.warn("optimizer", at, f"stage 2 does not freeze what {name} of {script} trains")
             if f"{name}.load_state_dict(" not in ast.unparse(trained or ast.Pass()):
                 fork.one_run = fork.one_run or f"{script} does not resume what {name} trains"

@@ -664,6 +664,16 @@ REFUSED = {
         ],
         "makes opacities from pc.net",
     ),
+    "another framework": (
+        {},
+        [
+            (
+                "from gaussian_renderer import render",
+                "import jittor\nfrom gaussian_renderer import render",
+            )
+        ],
+        "train.py trains by jittor",
+    ),
     "processes": (
         {},
         [
