@@ -37,7 +37,9 @@ _CHECKPOINT = re.compile(
     rf"(^|[/'\"]){CHECKPOINT}(['\"] \+ str\(\w+\) \+ ['\"]|{{\w*(:\w+)?}}|%d)\.pth"
 )
 """A checkpoint's name in a source: its beginning, the iteration and nothing else."""
-_PROCESSES = re.compile(r"\bProcess\((.*\W)?target=|\bmp\.spawn\(")
+_PROCESSES = re.compile(
+    r"\bProcess\((.*\W)?target=|\bmp\.spawn\(|\b(DDP|DistributedDataParallel)\("
+)
 _EMPTIES = re.compile(r"\brmtree\(\w+\.model_path")
 """A script that removes its output folder, and with it the checkpoint to resume."""
 STATISTICS = {"oneupSHdegree", "add_densification_stats"}
@@ -263,6 +265,9 @@ def _check_script(fork: Fork, script: str) -> None:
     if _PROCESSES.search(ast.unparse(tree)):
         found = "it trains in processes of its own"
         fork.refuse("script", script, found, "one process that keeps its files")
+    owners = "|".join(map(re.escape, sorted(_owners(tree)))) or "-"
+    if copied := re.search(rf"\bdeepcopy\(({owners})\)", ast.unparse(tree)):
+        fork.refuse("script", script, f"copies its model, {copied[0]}", "the one that it makes")
     if several := _trainings(fork.repo, module_of(script)):
         fork.refuse("script", script, *several)
     compared = [node for node in nodes(tree) if isinstance(node, ast.Compare)]
@@ -347,9 +352,14 @@ def _not_resumed(repo: HostRepo, script: str, tree: ast.Module) -> str:
     if any(node.lineno > read.get(name, node.lineno) for node, name in assigned):
         return f"{script} does not go on at the iteration of its checkpoint"
     capture = _methods(repo)["capture"]
-    if not _returns_state(capture):
+    if not any("optimizer.state_dict()" in ast.unparse(each) for each in _state(capture)):
         return "its checkpoints have no state of an optimizer"
     whole = re.findall(r"self\.(\w+)(?=[,)])", ast.unparse(capture))
+    taken, state = _taken_back(_methods(repo)["restore"]), _state(capture)
+    fixed = [each for each in state if not isinstance(each, ast.Starred)]
+    more = len(state) - len(fixed)
+    if taken and not any(n >= len(fixed) if more else n == len(fixed) for n in taken):
+        return f"its restore takes {taken[0]} values, and capture gives {len(state)}"
     trained = re.findall(r"self\.(\w+)\.parameters\(", ast.unparse(repo.tree(MODEL) or ast.Pass()))
     if networks := sorted({*whole} & {*trained}):
         return f"its checkpoints hold whole networks, {', '.join(networks)}"
@@ -435,12 +445,19 @@ def _read_methods(fork: Fork) -> None:
         if not more:
             break
         changing |= more
-    changing -= {name for name in changing if _MAKES.fullmatch(name)}
     fork.setups = tuple(
         name
         for name, body in methods.items()
         if any(_target(node) == "optimizer" for node in nodes(body)) and name != "__init__"
     )
+    trained = {
+        name
+        for script in fork.scripts
+        for node in nodes(fork.repo.tree(module_of(script)))
+        if _is_loop(node)
+        for _, name in _method_calls(node)
+    }
+    changing -= {each for each in changing if _MAKES.fullmatch(each)} - (trained - set(fork.setups))
     called: dict[str, None] = {}
     for module, tree in fork.trees.items():
         owners = _owners(tree)
@@ -486,13 +503,26 @@ def plain_distances(repo: HostRepo) -> bool:
     return True
 
 
-def _returns_state(capture: Function) -> bool:
-    return any(
-        isinstance(node, ast.Return)
-        and isinstance(node.value, ast.Tuple | ast.List)
-        and any("optimizer.state_dict()" in ast.unparse(each) for each in node.value.elts)
-        for node in nodes(capture)
-    )
+def _state(capture: Function) -> list[ast.expr]:
+    """What a method returns as a tuple, the longest of several."""
+    given = (node.value for node in nodes(capture) if isinstance(node, ast.Return))
+    listed = (each.elts for each in given if isinstance(each, ast.Tuple | ast.List))
+    return max(listed, key=len, default=[])
+
+
+def _taken_back(restore: Function) -> list[int]:
+    """Into how many values a method unpacks its first argument."""
+    first = restore.args.args[1].arg if len(restore.args.args) > 1 else ""
+    unpacked = [
+        node.targets[0]
+        for node in nodes(restore)
+        if isinstance(node, ast.Assign) and getattr(node.value, "id", "") == first
+    ]
+    return [
+        len(each.elts)
+        for each in unpacked
+        if isinstance(each, ast.Tuple) and not any(isinstance(e, ast.Starred) for e in each.elts)
+    ]
 
 
 def _target(node: ast.AST) -> str:

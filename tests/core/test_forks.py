@@ -459,6 +459,14 @@ NOT_RESUMED = {
         "state, at = torch.load(checkpoint)\n        gaussians.restore(state)\n        at = 0",
     ),
     "a lost parameter": ("self.poses)", "self.masks)"),
+    "more than is taken back": (
+        "training_setup(training_args)\n\n    def construct",
+        "training_setup(training_args)\n        self._xyz, rest = model_args\n\n    def construct",
+    ),
+    "a set": (
+        "(self._xyz, self._scaling, *values, self.optimizer.state_dict(), self.poses)",
+        "{self._xyz, self._scaling, *values, self.optimizer.state_dict(), self.poses}",
+    ),
     "a dict": ("((gaussians.capture(), iteration)", '({"model": gaussians.capture(), "at": 1}'),
     "a removed folder": ("scene = Scene(", "shutil.rmtree(opt.model_path); scene = Scene("),
     "a lost state": ("self.optimizer.state_dict()", "None"),
@@ -664,6 +672,21 @@ REFUSED = {
         ],
         "makes opacities from pc.net",
     ),
+    "a copy of the model": (
+        {},
+        [
+            (
+                "    for iteration in range",
+                "    best = deepcopy(gaussians)\n    for iteration in range",
+            )
+        ],
+        "copies its model, deepcopy(gaussians)",
+    ),
+    "a model in several processes": (
+        {},
+        [("    for iteration in range", "    ddp = DDP(gaussians)\n    for iteration in range")],
+        "processes of its own",
+    ),
     "another framework": (
         {},
         [
@@ -750,6 +773,14 @@ def test_rows_and_values_stand_still_by_what_methods_do_not_by_their_names(tmp_p
     seams = ForkAdapter().seams_for(fork(tmp_path))
     still = [each.attribute.split(".")[1] for each in seams if each.role is Role.STILL]
     assert still == ["oneupSHdegree", "thin_out", "spread"]
+
+
+def test_a_method_that_makes_a_model_changes_it_where_it_is_called_in_training(tmp_path):
+    body = "    def set_rows(self, rows):\n        self._xyz = rows\n\n    def capture"
+    changes = ("    def capture", body), ("gaussians.oneupSHdegree()", "gaussians.set_rows(means)")
+    assert read_fork(fork(tmp_path / "in", *changes)).still == ("set_rows", "thin_out", "spread")
+    before = (changes[0], ("    scene = Scene(", "    gaussians.set_rows(1)\n    scene = Scene("))
+    assert "set_rows" not in read_fork(fork(tmp_path / "before", *before)).still
 
 
 def test_joint_learning_needs_to_know_where_the_model_comes_to_rest(tmp_path):
