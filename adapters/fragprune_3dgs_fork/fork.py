@@ -17,7 +17,6 @@ from fragprune_3dgs_fork.rasterizer import (
     meaning,
 )
 from fragprune_graphdeco import kernels, plain, reading
-from fragprune_graphdeco.reading import module_of
 from fragprune_plugins.adapting import (
     Finding,
     Function,
@@ -133,7 +132,7 @@ class Fork:
 
     def is_off(self, name: str) -> bool:
         """Whether an option or an attribute of the model is None or False by default."""
-        modules = ("arguments", MODEL, *map(module_of, self.scripts))
+        modules = ("arguments", MODEL, *map(reading.module_of, self.scripts))
         values = [each for m in modules for each in reading.defaults(self.repo, m, name)]
         return bool(values) and all(map(is_off, values))
 
@@ -160,7 +159,7 @@ class Fork:
     @cached_property
     def trees(self) -> dict[str, ast.Module]:
         """The scripts and the checkout's own modules that they import, without model and draws."""
-        seen = reading.reached(self.repo, map(module_of, self.scripts), RENDERER)
+        seen = reading.reached(self.repo, map(reading.module_of, self.scripts), RENDERER)
         return {each: tree for each, tree in seen.items() if not _OF_MODELS.search(each)}
 
 
@@ -204,11 +203,13 @@ def _read_scripts(fork: Fork, scripts: tuple[str, ...]) -> None:
     """Of these scripts, the training scripts of the model class: they make it once."""
     repo = fork.repo
     for script in scripts:
-        tree = repo.tree(module_of(script))
+        tree = repo.tree(reading.module_of(script))
         assert tree is not None  # it is a candidate
         networks = _networks(repo, script)
         made = [
-            each for each in reading.made_models(repo, module_of(script)) if each not in networks
+            each
+            for each in reading.made_models(repo, reading.module_of(script))
+            if each not in networks
         ]
         if CLASS in made and len(set(made)) == 1:
             fork.scripts += (script,)
@@ -236,7 +237,7 @@ def _lacking(repo: HostRepo, script: str) -> str:
         return ""
     own = [each.arg for each in function.args.args[1:]]
     needed = own[: len(own) - len(function.args.defaults)]
-    for call in repo.calls(module_of(script), CLASS):
+    for call in repo.calls(reading.module_of(script), CLASS):
         given = {each.arg for each in call.keywords}
         several = None in given or any(isinstance(each, ast.Starred) for each in call.args)
         if absent := [each for each in needed[len(call.args) :] if each not in given]:
@@ -248,7 +249,7 @@ def _networks(repo: HostRepo, script: str) -> set[str]:
     """Classes that a script imports and that save no PLY: they are no models of Gaussians."""
     return {
         node.name
-        for tree in reading.reached(repo, [module_of(script)], RENDERER).values()
+        for tree in reading.reached(repo, [reading.module_of(script)], RENDERER).values()
         for node in tree.body
         if isinstance(node, ast.ClassDef)
         and node.name != CLASS
@@ -260,7 +261,7 @@ def _networks(repo: HostRepo, script: str) -> set[str]:
 
 def _check_script(fork: Fork, script: str) -> None:
     """A script trains in this process, and goes backward once in an iteration."""
-    tree = fork.repo.tree(module_of(script))
+    tree = fork.repo.tree(reading.module_of(script))
     assert tree is not None  # it is a candidate
     if _PROCESSES.search(ast.unparse(tree)):
         found = "it trains in processes of its own"
@@ -268,7 +269,7 @@ def _check_script(fork: Fork, script: str) -> None:
     owners = "|".join(map(re.escape, sorted(_owners(tree)))) or "-"
     if copied := re.search(rf"\bdeepcopy\(({owners})\)", ast.unparse(tree)):
         fork.refuse("script", script, f"copies its model, {copied[0]}", "the one that it makes")
-    if several := _trainings(fork.repo, module_of(script)):
+    if several := _trainings(fork.repo, reading.module_of(script)):
         fork.refuse("script", script, *several)
     compared = [node for node in nodes(tree) if isinstance(node, ast.Compare)]
     tests = [ast.unparse(each) for each in compared if isinstance(each.ops[0], ast.In)]
@@ -375,7 +376,7 @@ def _not_resumed(repo: HostRepo, script: str, tree: ast.Module) -> str:
 def rests_after_densification(fork: Fork) -> bool:
     """Whether scripts change the model only where they ask for ``densify_until_iter``."""
     for script in fork.scripts:
-        tree = fork.repo.tree(module_of(script))
+        tree = fork.repo.tree(reading.module_of(script))
         inside = _while_densifying(tree)
         for node, name in _method_calls(tree) if tree else ():
             if name in fork.still and name != "oneupSHdegree" and id(node) not in inside:
@@ -453,7 +454,7 @@ def _read_methods(fork: Fork) -> None:
     trained = {
         name
         for script in fork.scripts
-        for node in nodes(fork.repo.tree(module_of(script)))
+        for node in nodes(fork.repo.tree(reading.module_of(script)))
         if _is_loop(node)
         for _, name in _method_calls(node)
     }
@@ -462,7 +463,7 @@ def _read_methods(fork: Fork) -> None:
     for module, tree in fork.trees.items():
         owners = _owners(tree)
         statements = {id(each.value) for each in nodes(tree) if isinstance(each, ast.Expr)}
-        early = _while_densifying(tree) if module in map(module_of, fork.scripts) else set()
+        early = _while_densifying(tree) if module in map(reading.module_of, fork.scripts) else set()
         for node, name in _method_calls(tree):
             if name in changing:
                 called[name] = None
@@ -565,7 +566,7 @@ def _read_changes(fork: Fork) -> None:
             at = fork.repo.at(module, line)
             fork.refuse("row-change", at, f"changes {name} outside the model's methods", "none")
     for script in fork.scripts:
-        trained = fork.repo.tree(module_of(script))
+        trained = fork.repo.tree(reading.module_of(script))
         owners = _owners(trained) if trained else set()
         for node in nodes(trained):
             if isinstance(node, ast.Assign) and _OPTIMIZER.match(ast.unparse(node.value)):
@@ -574,13 +575,16 @@ def _read_changes(fork: Fork) -> None:
                 name = ast.unparse(node.func).removesuffix(".step")
                 owner = name.rpartition(".")[0]
                 if len(node.args) == 1:  # two are those of a sparse Adam
-                    at, found = fork.repo.at(module_of(script), node.lineno), ast.unparse(node)[:60]
+                    at, found = (
+                        fork.repo.at(reading.module_of(script), node.lineno),
+                        ast.unparse(node)[:60],
+                    )
                     fork.refuse("optimizer", at, f"another optimizer, {found}", "step()")
                 if _MODELS.search(owner) or owner.split("[")[0] in {"", *owners}:
                     continue
             else:
                 continue
-            at = fork.repo.at(module_of(script), node.lineno)
+            at = fork.repo.at(reading.module_of(script), node.lineno)
             fork.warn("optimizer", at, f"stage 2 does not freeze what {name} of {script} trains")
             if f"{name}.load_state_dict(" not in ast.unparse(trained or ast.Pass()):
                 fork.one_run = fork.one_run or f"{script} does not resume what {name} trains"
