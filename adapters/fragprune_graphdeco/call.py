@@ -167,7 +167,7 @@ def _taken(body: Function, whole: str) -> tuple[str, ...]:
     taken, known = dict[int, set[str]](), 0
     for node in (each for each in nodes(body) if isinstance(each, ast.Assign)):
         target = node.targets[0]
-        if getattr(node.value, "id", "") == whole:
+        if whole and getattr(node.value, "id", "") == whole:
             names = [getattr(each, "id", "") for each in getattr(target, "elts", ())]
             known += bool(names)
             for number, name in enumerate(names):
@@ -178,8 +178,8 @@ def _taken(body: Function, whole: str) -> tuple[str, ...]:
                 taken.setdefault(index, set()).add(getattr(target, "id", ""))
                 known += 1
     lengths = sum(ast.unparse(each) == f"len({whole})" for each in nodes(body))
-    reads = [each for each in nodes(body) if getattr(each, "id", "") == whole]
-    stored = sum(isinstance(each.ctx, ast.Store) for each in reads)  # type: ignore[attr-defined]
+    reads = [each for each in nodes(body) if isinstance(each, ast.Name) and each.id == whole]
+    stored = sum(isinstance(each.ctx, ast.Store) for each in reads)
     if known + lengths + stored != len(reads) or any(len(each) > 1 for each in taken.values()):
         return ()
     every = range(max(taken, default=-1) + 1)

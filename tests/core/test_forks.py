@@ -729,6 +729,11 @@ REFUSED = {
         "a camera and a model",
     ),
     "a whole result": ({}, [("image, radii = rasterizer(", "both = rasterizer(")], "not unpacked"),
+    "a result that is returned at once": (
+        {},
+        [("image, radii = rasterizer(", "return rasterizer(")],
+        "not unpacked",
+    ),
     "a whole result that is handed on": (
         {},
         [("image, radii =", "both ="), (KEYS, f"    image, radii = cut(both), both[1]\n{KEYS}")],
