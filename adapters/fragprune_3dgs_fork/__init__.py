@@ -22,6 +22,7 @@ from fragprune_3dgs_fork.fork import (
     CLASS,
     HANDED,
     MODEL,
+    POSES,
     RENDERER,
     Fork,
     plain_distances,
@@ -42,6 +43,7 @@ from fragprune_plugins.adapting import (
     RasterOutputs,
     Role,
     Seam,
+    SeamCall,
     UsageError,
 )
 
@@ -118,11 +120,17 @@ class ForkDialect(GraphdecoDialect):
             EngineError: a setting is not neutral, or the host reads gradients that our engines do
                 not compute.
         """
+        import torch
+
         fork, inputs = self.fork, super().unpack(call)
         confidence = getattr(call.settings, "confidence", None)
         if confidence is not None and not bool((confidence == 1).all()):
             self._refuse("confidence", "values other than 1", "1 everywhere, which changes nothing")
         self.expect_off(call)
+        trained = not call.still and torch.is_grad_enabled()
+        for name, value in ((each, call.get(each)) for each in sorted(POSES)):
+            if value is not None and (value.any() or (trained and value.requires_grad)):
+                self._refuse(name, "a camera's gradients", "cameras that stand still, or stage 2")
         if not call.still and call["means2D"].shape[1] > SCREEN:
             self._refuse("means2D", "absolute screen gradients", "three columns, or stage 2")
         if not call.still and fork.scaled:
@@ -242,6 +250,16 @@ class ForkDialect(GraphdecoDialect):
         return {name: module for name, module in made.items() if name in self.names()}
 
 
+def asked(call: SeamCall) -> NoReturn:
+    """In place of a densification whose result the host reads, where the model stands still."""
+    raise EngineError(
+        f"{call.seam.attribute}, whose result the host reads",
+        "called in stage 2, where no Gaussian is added or removed",
+        "a densification that ends before",
+        "Lower --densify_until_iter.",
+    )
+
+
 class ForkAdapter(GraphdecoAdapter):
     """The adapter of forks that no other adapter knows."""
 
@@ -307,7 +325,10 @@ class ForkAdapter(GraphdecoAdapter):
             *(of(Role.STEP, name) for name in ("update_learning_rate",) if fork.defines(name)),
             of(Role.KEEP, "_prune_optimizer"),
             of(Role.APPEND, "cat_tensors_to_optimizer"),
-            *(of(Role.STILL, name) for name in fork.still),
+            *(
+                of(Role.STILL, each, asked if each in fork.answering else None)
+                for each in fork.still
+            ),
             of(Role.SAVE, "save_ply"),
             of(Role.LOAD, "load_ply"),
             *(() if fork.one_run else (of(Role.CAPTURE, "capture"), of(Role.RESTORE, "restore"))),

@@ -36,7 +36,9 @@ _CHECKPOINT = re.compile(
     rf"(^|[/'\"]){CHECKPOINT}(['\"] \+ str\(\w+\) \+ ['\"]|{{\w*(:\w+)?}}|%d)\.pth"
 )
 """A checkpoint's name in a source: its beginning, the iteration and nothing else."""
-_PROCESSES = re.compile(r"\bProcess\((.*\W)?target=|\bmp\.spawn\(")
+_PROCESSES = re.compile(
+    r"\bProcess\((.*\W)?target=|\bmp\.spawn\(|\b(DDP|DistributedDataParallel)\("
+)
 _EMPTIES = re.compile(r"\brmtree\(\w+\.model_path")
 """A script that removes its output folder, and with it the checkpoint to resume."""
 STATISTICS = {"oneupSHdegree", "add_densification_stats"}
@@ -49,9 +51,11 @@ _OPTIMIZER = re.compile(r"(torch\.)?(optim\.)?\w*(Adam|SGD|RMSprop)\w*\(")
 _CAMERA = re.compile(r"view|cam")
 _MODEL_ARGUMENTS = ("pc", "gaussians", "gaussian", "model")
 
-NEUTRAL = {"antialiasing", "confidence"}
+NEUTRAL = {"antialiasing", "confidence", "projmatrix_raw"}
 """Further settings that the engines know, or that are checked to be neutral at every call."""
-SERVED = {"dc"}
+POSES = {"theta", "rho"}
+"""Arguments that only get a camera's gradients: how it turns and moves, 0 at every call."""
+SERVED = {"dc", *POSES}
 """Further arguments that the engines know."""
 _SCREEN = re.compile(r"means2D_\w+")
 """Further tensors that get a gradient on the screen, by which Gaussians are densified."""
@@ -89,6 +93,7 @@ class Fork:
         draws: the drawing functions that these reach.
         outputs: by package, what its rasterizer returns.
         still: methods of the model that scripts call, and that change it.
+        answering: those whose result they read, while they densify.
         setups: methods that make the optimizer.
         blended: by package, the argument with channels that are blended beside the colours.
         options: off by default, under which scripts draw by other functions.
@@ -106,6 +111,7 @@ class Fork:
     draws: tuple[Draw, ...] = ()
     outputs: dict[str, tuple[Output, ...]] = field(default_factory=dict)
     still: tuple[str, ...] = ()
+    answering: frozenset[str] = frozenset()
     setups: tuple[str, ...] = ()
     blended: dict[str, str] = field(default_factory=dict)
     options: frozenset[str] = frozenset()
@@ -126,7 +132,7 @@ class Fork:
 
     def is_off(self, name: str) -> bool:
         """Whether an option or an attribute of the model is None or False by default."""
-        modules = ("arguments", MODEL, *map(_module, self.scripts))
+        modules = ("arguments", MODEL, *map(reading.module_of, self.scripts))
         values = [each for m in modules for each in reading.defaults(self.repo, m, name)]
         return bool(values) and all(map(is_off, values))
 
@@ -153,7 +159,7 @@ class Fork:
     @cached_property
     def trees(self) -> dict[str, ast.Module]:
         """The scripts and the checkout's own modules that they import, without model and draws."""
-        seen = reading.reached(self.repo, map(_module, self.scripts), RENDERER)
+        seen = reading.reached(self.repo, map(reading.module_of, self.scripts), RENDERER)
         return {each: tree for each, tree in seen.items() if not _OF_MODELS.search(each)}
 
 
@@ -190,11 +196,6 @@ def _read(repo: HostRepo, scripts: tuple[str, ...]) -> Fork:
     return fork
 
 
-def _module(script: str) -> str:
-    """The module that a script is, of a path below the checkout."""
-    return script.removesuffix(".py").replace("/", ".")
-
-
 # -- scripts ---------------------------------------------------------------------------------------
 
 
@@ -202,10 +203,14 @@ def _read_scripts(fork: Fork, scripts: tuple[str, ...]) -> None:
     """Of these scripts, the training scripts of the model class: they make it once."""
     repo = fork.repo
     for script in scripts:
-        tree = repo.tree(_module(script))
+        tree = repo.tree(reading.module_of(script))
         assert tree is not None  # it is a candidate
         networks = _networks(repo, script)
-        made = [each for each in reading.made_models(repo, _module(script)) if each not in networks]
+        made = [
+            each
+            for each in reading.made_models(repo, reading.module_of(script))
+            if each not in networks
+        ]
         if CLASS in made and len(set(made)) == 1:
             fork.scripts += (script,)
             if lacking := _lacking(repo, script):
@@ -217,7 +222,9 @@ def _read_scripts(fork: Fork, scripts: tuple[str, ...]) -> None:
             fork.unserved[script] = f"makes {', '.join(dict.fromkeys(made))}"
     if not fork.scripts:
         others = "; ".join(f"{script} {why}" for script, why in fork.unserved.items())
-        found = others or "no script that trains a GaussianModel"
+        names = (each.stem for each in sorted(repo.root.glob("*train*.py")))
+        broken = [f"{each}.py is no valid Python" for each in names if repo.tree(each) is None]
+        found = others or "; ".join(broken) or "no script that trains a GaussianModel"
         fork.refuse("other-host", str(repo.root), found, "a *train*.py that makes GaussianModels")
     for script in fork.scripts:
         _check_script(fork, script)
@@ -230,7 +237,7 @@ def _lacking(repo: HostRepo, script: str) -> str:
         return ""
     own = [each.arg for each in function.args.args[1:]]
     needed = own[: len(own) - len(function.args.defaults)]
-    for call in repo.calls(_module(script), CLASS):
+    for call in repo.calls(reading.module_of(script), CLASS):
         given = {each.arg for each in call.keywords}
         several = None in given or any(isinstance(each, ast.Starred) for each in call.args)
         if absent := [each for each in needed[len(call.args) :] if each not in given]:
@@ -242,7 +249,7 @@ def _networks(repo: HostRepo, script: str) -> set[str]:
     """Classes that a script imports and that save no PLY: they are no models of Gaussians."""
     return {
         node.name
-        for tree in reading.reached(repo, [_module(script)], RENDERER).values()
+        for tree in reading.reached(repo, [reading.module_of(script)], RENDERER).values()
         for node in tree.body
         if isinstance(node, ast.ClassDef)
         and node.name != CLASS
@@ -254,12 +261,15 @@ def _networks(repo: HostRepo, script: str) -> set[str]:
 
 def _check_script(fork: Fork, script: str) -> None:
     """A script trains in this process, and goes backward once in an iteration."""
-    tree = fork.repo.tree(_module(script))
+    tree = fork.repo.tree(reading.module_of(script))
     assert tree is not None  # it is a candidate
     if _PROCESSES.search(ast.unparse(tree)):
         found = "it trains in processes of its own"
         fork.refuse("script", script, found, "one process that keeps its files")
-    if several := _trainings(fork.repo, _module(script)):
+    owners = "|".join(map(re.escape, sorted(_owners(tree)))) or "-"
+    if copied := re.search(rf"\bdeepcopy\(({owners})\)", ast.unparse(tree)):
+        fork.refuse("script", script, f"copies its model, {copied[0]}", "the one that it makes")
+    if several := _trainings(fork.repo, reading.module_of(script)):
         fork.refuse("script", script, *several)
     compared = [node for node in nodes(tree) if isinstance(node, ast.Compare)]
     tests = [ast.unparse(each) for each in compared if isinstance(each.ops[0], ast.In)]
@@ -343,9 +353,14 @@ def _not_resumed(repo: HostRepo, script: str, tree: ast.Module) -> str:
     if any(node.lineno > read.get(name, node.lineno) for node, name in assigned):
         return f"{script} does not go on at the iteration of its checkpoint"
     capture = _methods(repo)["capture"]
-    if not _returns_state(capture):
+    if not any("optimizer.state_dict()" in ast.unparse(each) for each in _state(capture)):
         return "its checkpoints have no state of an optimizer"
     whole = re.findall(r"self\.(\w+)(?=[,)])", ast.unparse(capture))
+    taken, state = _taken_back(_methods(repo)["restore"]), _state(capture)
+    fixed = [each for each in state if not isinstance(each, ast.Starred)]
+    more = len(state) - len(fixed)
+    if taken and not any(n >= len(fixed) if more else n == len(fixed) for n in taken):
+        return f"its restore takes {taken[0]} values, and capture gives {len(state)}"
     trained = re.findall(r"self\.(\w+)\.parameters\(", ast.unparse(repo.tree(MODEL) or ast.Pass()))
     if networks := sorted({*whole} & {*trained}):
         return f"its checkpoints hold whole networks, {', '.join(networks)}"
@@ -361,18 +376,23 @@ def _not_resumed(repo: HostRepo, script: str, tree: ast.Module) -> str:
 def rests_after_densification(fork: Fork) -> bool:
     """Whether scripts change the model only where they ask for ``densify_until_iter``."""
     for script in fork.scripts:
-        tree = fork.repo.tree(_module(script))
-        inside = {
-            id(inner)
-            for node in nodes(tree)
-            if isinstance(node, ast.If) and "densify_until_iter" in ast.unparse(node.test)
-            for each in node.body
-            for inner in nodes(each)
-        }
+        tree = fork.repo.tree(reading.module_of(script))
+        inside = _while_densifying(tree)
         for node, name in _method_calls(tree) if tree else ():
             if name in fork.still and name != "oneupSHdegree" and id(node) not in inside:
                 return False
     return True
+
+
+def _while_densifying(tree: ast.AST | None) -> set[int]:
+    """What a script does only where it asks for ``densify_until_iter``."""
+    return {
+        id(inner)
+        for node in nodes(tree)
+        if isinstance(node, ast.If) and "densify_until_iter" in ast.unparse(node.test)
+        for each in node.body
+        for inner in nodes(each)
+    }
 
 
 def _in_loop(tree: ast.AST, name: str, inside: bool = False) -> bool:
@@ -426,22 +446,32 @@ def _read_methods(fork: Fork) -> None:
         if not more:
             break
         changing |= more
-    changing -= {name for name in changing if _MAKES.fullmatch(name)}
     fork.setups = tuple(
         name
         for name, body in methods.items()
         if any(_target(node) == "optimizer" for node in nodes(body)) and name != "__init__"
     )
+    trained = {
+        name
+        for script in fork.scripts
+        for node in nodes(fork.repo.tree(reading.module_of(script)))
+        if _is_loop(node)
+        for _, name in _method_calls(node)
+    }
+    changing -= {each for each in changing if _MAKES.fullmatch(each)} - (trained - set(fork.setups))
     called: dict[str, None] = {}
     for module, tree in fork.trees.items():
         owners = _owners(tree)
         statements = {id(each.value) for each in nodes(tree) if isinstance(each, ast.Expr)}
+        early = _while_densifying(tree) if module in map(reading.module_of, fork.scripts) else set()
         for node, name in _method_calls(tree):
             if name in changing:
                 called[name] = None
                 owner = ast.unparse(node.func.value)  # type: ignore[attr-defined]
                 own = _MODELS.search(owner) or owner.split("[")[0] in owners
-                if own and id(node) not in statements:
+                if own and id(node) in early - statements:
+                    fork.answering |= {name}
+                elif own and id(node) not in statements:
                     at = fork.repo.at(module, node.lineno)
                     fork.refuse("row-change", at, f"reads what {name} returns", "a statement")
     fork.still = tuple(name for name in methods if name in called)
@@ -474,13 +504,26 @@ def plain_distances(repo: HostRepo) -> bool:
     return True
 
 
-def _returns_state(capture: Function) -> bool:
-    return any(
-        isinstance(node, ast.Return)
-        and isinstance(node.value, ast.Tuple | ast.List)
-        and any("optimizer.state_dict()" in ast.unparse(each) for each in node.value.elts)
-        for node in nodes(capture)
-    )
+def _state(capture: Function) -> list[ast.expr]:
+    """What a method returns as a tuple, the longest of several."""
+    given = (node.value for node in nodes(capture) if isinstance(node, ast.Return))
+    listed = (each.elts for each in given if isinstance(each, ast.Tuple | ast.List))
+    return max(listed, key=len, default=[])
+
+
+def _taken_back(restore: Function) -> list[int]:
+    """Into how many values a method unpacks its first argument."""
+    first = restore.args.args[1].arg if len(restore.args.args) > 1 else ""
+    unpacked = [
+        node.targets[0]
+        for node in nodes(restore)
+        if isinstance(node, ast.Assign) and getattr(node.value, "id", "") == first
+    ]
+    return [
+        len(each.elts)
+        for each in unpacked
+        if isinstance(each, ast.Tuple) and not any(isinstance(e, ast.Starred) for e in each.elts)
+    ]
 
 
 def _target(node: ast.AST) -> str:
@@ -507,7 +550,7 @@ def _assigned(body: ast.AST, owner: str = "") -> Iterator[tuple[int, str]]:
             for each in target.elts if isinstance(target, ast.Tuple) else [target]:
                 inner: ast.AST = each
                 while isinstance(inner, ast.Subscript | ast.Attribute):
-                    if isinstance(inner, ast.Attribute) and inner.attr == "grad":
+                    if getattr(inner, "attr", "") in ("grad", "requires_grad"):
                         break
                     if isinstance(inner, ast.Attribute) and inner.attr in PARAMETERS:
                         if not owner or ast.unparse(inner.value) == owner:
@@ -523,7 +566,7 @@ def _read_changes(fork: Fork) -> None:
             at = fork.repo.at(module, line)
             fork.refuse("row-change", at, f"changes {name} outside the model's methods", "none")
     for script in fork.scripts:
-        trained = fork.repo.tree(_module(script))
+        trained = fork.repo.tree(reading.module_of(script))
         owners = _owners(trained) if trained else set()
         for node in nodes(trained):
             if isinstance(node, ast.Assign) and _OPTIMIZER.match(ast.unparse(node.value)):
@@ -532,13 +575,16 @@ def _read_changes(fork: Fork) -> None:
                 name = ast.unparse(node.func).removesuffix(".step")
                 owner = name.rpartition(".")[0]
                 if len(node.args) == 1:  # two are those of a sparse Adam
-                    at, found = fork.repo.at(_module(script), node.lineno), ast.unparse(node)[:60]
+                    at, found = (
+                        fork.repo.at(reading.module_of(script), node.lineno),
+                        ast.unparse(node)[:60],
+                    )
                     fork.refuse("optimizer", at, f"another optimizer, {found}", "step()")
                 if _MODELS.search(owner) or owner.split("[")[0] in {"", *owners}:
                     continue
             else:
                 continue
-            at = fork.repo.at(_module(script), node.lineno)
+            at = fork.repo.at(reading.module_of(script), node.lineno)
             fork.warn("optimizer", at, f"stage 2 does not freeze what {name} of {script} trains")
             if f"{name}.load_state_dict(" not in ast.unparse(trained or ast.Pass()):
                 fork.one_run = fork.one_run or f"{script} does not resume what {name} trains"
@@ -662,6 +708,8 @@ def _check_call(fork: Fork, at: str, function: str, call: graphdeco.CallInSource
     """Settings and arguments besides the known ones: off, or without a part in the picture."""
     if blended := blended_argument(fork.repo, call):
         fork.blended[call.package] = blended
+    if POSES & call.arguments:
+        fork.warn("rasterizer-call", at, "the cameras, which stand still in stage 2")
     screens = frozenset(filter(_SCREEN.fullmatch, call.arguments))
     fork.screens |= screens
     given = call.arguments - SERVED - screens - {blended}

@@ -110,7 +110,7 @@ def _inlined(text: str) -> str:
 def _written(text: str, name: str, buffer: str, rule: re.Pattern[str]) -> bool:
     """Whether a sum, and nothing else, goes into the buffer that is called most like a value."""
     stored: dict[str, set[str]] = {}
-    for own, value in re.findall(rf"\bout_(\w*(?:{buffer})\w*)\[pix_id\]=([^;]+);", text):
+    for own, value in re.findall(rf"\b(?:out_)?(\w*(?:{buffer})\w*)\[pix_id\]=([^;]+);", text):
         stored.setdefault(own, set()).add(value)
     named = [each for each in stored if _words(each) <= _words(name)]
     values = set().union(*(stored[each] for each in named or stored))

@@ -19,6 +19,7 @@ from fragprune_graphdeco.reading import (
     compiled,
     defaults,
     made_models,
+    module_of,
     read_flags,
     read_getters,
     renamed,
@@ -282,7 +283,7 @@ class GraphdecoAdapter(ScriptAdapter):
             f"no {name}" for name in self.scripts_of(repo) if not (repo.root / name).is_file()
         ]
         for script in self.scripts_of(repo):
-            made = made_models(repo, script.removesuffix(".py").replace("/", "."))
+            made = made_models(repo, module_of(script))
             if made and "GaussianModel" not in made:
                 missing.append(f"{script} makes {', '.join(dict.fromkeys(made))}")
         for module, _, name in (each.rpartition(":") for each in self.own_names):

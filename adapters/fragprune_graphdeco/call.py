@@ -148,15 +148,42 @@ def _drawn(
         own = imported.of(called, RASTERIZER)
         if own or getattr(called, "id", None) in rasterizers:
             target = targets.get(id(node), node)
-            values = target.elts if isinstance(target, ast.Tuple) else []
+            values = [getattr(each, "id", "") for each in getattr(target, "elts", [])]
             made: ast.Call = called if own else rasterizers[called.id]  # type: ignore[attr-defined, assignment]
             keywords = [each for each in made.keywords if each.arg != "raster_settings"]
             yield (
                 target.lineno,
                 imported.package(made),
-                tuple(getattr(each, "id", "") for each in values),
+                tuple(values) or _taken(body, getattr(target, "id", "")),
                 {each.arg: each.value for each in [*keywords, *node.keywords] if each.arg},
             )
+
+
+def _taken(body: Function, whole: str) -> tuple[str, ...]:
+    """Names that a function gives the values of a result, which it keeps under a name first.
+
+    Of several lengths that it asks for the greatest; () if it does anything else with the result.
+    """
+    taken, known = dict[int, set[str]](), 0
+    for node in (each for each in nodes(body) if isinstance(each, ast.Assign)):
+        target = node.targets[0]
+        if whole and getattr(node.value, "id", "") == whole:
+            names = [getattr(each, "id", "") for each in getattr(target, "elts", ())]
+            known += bool(names)
+            for number, name in enumerate(names):
+                taken.setdefault(number, set()).add(name)
+        for each in nodes(node.value):
+            index = getattr(each.slice, "value", None) if isinstance(each, ast.Subscript) else None
+            if type(index) is int and ast.unparse(each.value) == whole:  # type: ignore[attr-defined]
+                taken.setdefault(index, set()).add(getattr(target, "id", ""))
+                known += 1
+    lengths = sum(ast.unparse(each) == f"len({whole})" for each in nodes(body))
+    reads = [each for each in nodes(body) if isinstance(each, ast.Name) and each.id == whole]
+    stored = sum(isinstance(each.ctx, ast.Store) for each in reads)
+    if known + lengths + stored != len(reads) or any(len(each) > 1 for each in taken.values()):
+        return ()
+    every = range(max(taken, default=-1) + 1)
+    return tuple("".join(taken.get(number, ())) for number in every)
 
 
 class _Imported:

@@ -19,6 +19,8 @@ _DEEPEST = 6
 _NOT_THEIRS = {"third_party", "build", "dist", "site-packages", "node_modules", "glm", "backward"}
 _COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/", re.DOTALL)
 _ALPHA = re.compile(r"\b(?:float|double|auto)\s+alpha\s*=([^;]+);")
+_BRANCHES = re.compile(r"\balpha\s*=(?!=)([^;]+);")
+"""Of an alpha that is declared without a value."""
 _JACOBIAN = re.compile(r"\bJ\s*=\s*glm::mat3(?:x3)?\s*(\([^;]+\))\s*;")
 _FILTER = re.compile(r"\bcov(?:\[0\]\[0\]|\.x)\s*\+=?\s*([\w.]+)")
 _EWA = re.compile(  # the third row is of depth: no picture has it
@@ -205,7 +207,14 @@ class _Project:
             other = not known and not (kernel.projected and _POLYNOMIAL.fullmatch(exponent))
             yield self._finding(path, position, what, kernel.says, error=other)
         if not known and not unread:
-            yield self._finding(self.folder, 0, "no alpha = min(0.99, opacity exp())", kernel.says)
+            others = [each for each in self._found(_BRANCHES) if "exp(" not in each[2]]
+            path, position, text = next(iter(others), (self.folder, 0, ""))
+            what = (
+                f"alpha = {_short(text)}: no exp()"
+                if text
+                else "no alpha = min(0.99, opacity exp())"
+            )
+            yield self._finding(path, position, what, kernel.says)
 
     def _launched(self) -> set[str]:
         """Names of the kernels that the sources launch."""

@@ -452,6 +452,17 @@ def _needs(node: ast.If, off: Collection[str]) -> bool:
     return any(map(given.fullmatch, tests))
 
 
+def _never_set(repo: HostRepo, test: str) -> bool:
+    """Whether a test asks for an attribute that may be missing, and that no file sets."""
+    asked = re.fullmatch(r"getattr\(\w+, '(\w+)', None\)( is not None)?", test)
+    if asked is None:
+        return False
+    model = (repo.read(each) for each in (repo.root / "scene").glob("*.py"))
+    text = "".join((*model, *_scripts(repo).values()))
+    text = re.sub(rf"getattr\(\w+,\s*['\"]{asked[1]}['\"]", "", text)
+    return not re.search(rf"['\"]{asked[1]}['\"]|\.{asked[1]}\s*(:[^=\n]+)?=(?!=)", text)
+
+
 class Drawing:
     """A drawing function: where the inputs of its rasterizer come from.
 
@@ -507,6 +518,7 @@ class Drawing:
             if isinstance(node, ast.If):
                 test = ast.unparse(node.test)
                 on = self._is_colour_option(node) or _needs(node, self.off)
+                on = on or _never_set(self.repo, test)
                 none = any(re.fullmatch(rf"{each} is None|not {each}", test) for each in self.off)
                 self._collect([] if on else node.body)
                 if not none:
@@ -603,6 +615,7 @@ class Drawing:
         if cuts and not any(re.search(r"\[0?:3[,\]]", ast.unparse(each)) for each in cuts):
             cut = self.repo.at(self.module, cuts[0].lineno)
             yield f"its picture is cut out of a tensor with further channels ({cut})", False
+        yield from self._others_first()
         yield from self.inputs()
         calls = read_calls(self.repo, self.module, self.function.name)
         names = dict.fromkeys([*arguments(self.call), *(n for each in calls for n in each.given)])
@@ -611,6 +624,16 @@ class Drawing:
         for made in filter(None, map(self._made_into, _pictures(self.function))):
             at = self.repo.at(self.module, made.lineno)
             yield f"its picture is made into {ast.unparse(made)[:60]} ({at})", True
+
+    def _others_first(self) -> Iterator[tuple[str, bool]]:
+        """Another picture that the rasterizer returns before the one that counts."""
+        made = [node for node in nodes(self.function) if isinstance(node, ast.Assign)]
+        targets = [each.targets[0] for each in made if each.value is self.call]
+        names = [getattr(e, "id", "") for t in targets for e in getattr(t, "elts", ())]
+        shown = {getattr(each, "id", "") for each in _pictures(self.function)} & {*names}
+        before = names[: min(map(names.index, shown), default=0)]
+        if others := [each for each in before if re.search("image|render|rgb|colou?r", each)]:
+            yield f"its rasterizer returns another picture first, {others[0]}", False
 
     def _made_into(self, value: ast.expr, seen: tuple[str, ...] = ()) -> ast.expr | None:
         """The code that makes something else of the picture than its clamped numbers."""

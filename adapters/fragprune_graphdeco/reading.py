@@ -22,11 +22,12 @@ _SHAPES = {"repeat", "expand", "view", "reshape", "squeeze", "unsqueeze", "conti
 """Methods that change how often or in what shape a value stands, not the value."""
 _FUNCTIONAL = ("torch.nn.functional", "nn.functional", "F")
 ACTIVATIONS = {
-    "scaling_activation": ("torch.exp",),
-    "opacity_activation": ("torch.sigmoid",),
-    "rotation_activation": tuple(f"{each}.normalize" for each in _FUNCTIONAL),
+    "scaling_activation": ("torch.exp", "jt.exp"),
+    "opacity_activation": ("torch.sigmoid", "jt.sigmoid"),
+    "rotation_activation": tuple(f"{each}.normalize" for each in (*_FUNCTIONAL, "jt")),
 }
 """What activates each kind of value of a plain model."""
+_JOINS = ("torch.cat", "torch.concat", "jt.cat", "jt.concat")
 _ASKED = re.compile(r"self\.(\w+) is not None")
 _OTHER_FLAGS = ("hydra", "omegaconf", "tyro", "jsonargparse", "fire", "gin", "click", "absl")
 
@@ -68,7 +69,7 @@ def computed_getters(
         node
         for node in nodes(getters.pop("features"))
         if isinstance(node, ast.BinOp)
-        or (isinstance(node, ast.Call) and ast.unparse(node.func) != "torch.cat")
+        or (isinstance(node, ast.Call) and ast.unparse(node.func) not in _JOINS)
     ]
     wanted = {kind: {"stored" if kind == "xyz" else "activated"} for kind in GETTERS}
     return [
@@ -110,15 +111,23 @@ def renamed(repo: HostRepo) -> list[str]:
 
 
 def compiled(repo: HostRepo, scripts: Collection[str]) -> list[str]:
-    """Functions that scripts compile, and that go backward: no seam is reached in them."""
-    return [
+    """Functions that scripts compile, and that go backward, and scripts without torch: no seam is
+    reached in them.
+    """
+    jittor = [each for each in scripts if "jittor" in imported(repo.tree(module_of(each)))]
+    return [f"{script} trains by jittor" for script in jittor] + [
         f"{script} compiles {node.name}, which trains"
         for script in scripts
-        for node in nodes(repo.tree(script.removesuffix(".py").replace("/", ".")))
+        for node in nodes(repo.tree(module_of(script)))
         if isinstance(node, ast.FunctionDef)
         and any("torch.compile" in ast.unparse(each) for each in node.decorator_list)
         and any(getattr(each, "attr", "") == "backward" for each in nodes(node))
     ]
+
+
+def module_of(script: str) -> str:
+    """The module that a script is, of a path below the checkout."""
+    return script.removesuffix(".py").replace("/", ".")
 
 
 def _there(repo: HostRepo, name: str) -> bool:
@@ -246,8 +255,7 @@ def read_flags(repo: HostRepo, line: CommandLine) -> list[Finding]:
     wanted = ("iterations", "output", "save_checkpoints", "resume")
     found = []
     for script in line.scripts:
-        module = script.removesuffix(".py").replace("/", ".")
-        tree = repo.tree(module)
+        tree = repo.tree(module_of(script))
         if tree is None:
             continue
         if not any(

@@ -37,7 +37,7 @@ def call_of(scene, objects, still=True, columns=3, **settings):
         "projmatrix": view.projmatrix,
         "sh_degree": splats.sh_degree,
         "campos": view.campos,
-    } | settings
+    }
     arguments = {
         "means3D": splats.means,
         "means2D": torch.zeros(len(splats), columns),
@@ -46,7 +46,8 @@ def call_of(scene, objects, still=True, columns=3, **settings):
         "scales": splats.scales,
         "rotations": splats.rotations,
         "sh_objs": objects,
-    }
+    } | {name: settings.pop(name) for name in ("theta", "rho") if name in settings}
+    given |= settings
     packed = namedtuple("Settings", given)(**given)
     return HostCall(packed, arguments, "p:GaussianRasterizer.forward", still=still)
 
@@ -142,6 +143,8 @@ def test_a_value_that_was_seen_unread_may_be_handed_on_and_not_read(scene, objec
     [
         ({"confidence": torch.full((40, 1), 0.5)}, "confidence"),
         ({"still": False, "columns": 4}, "means2D"),
+        ({"theta": torch.ones(3)}, "theta"),
+        ({"still": False, "rho": torch.zeros(3, requires_grad=True)}, "rho"),
     ],
 )
 def test_what_our_engines_would_leave_out_is_refused(scene, objects, given, what):
@@ -149,7 +152,9 @@ def test_what_our_engines_would_leave_out_is_refused(scene, objects, given, what
         DIALECT.unpack(call_of(scene, objects, **given))
 
 
-@pytest.mark.parametrize("given", [{"confidence": torch.ones(40, 1)}, {"columns": 4}])
+@pytest.mark.parametrize(
+    "given", [{"confidence": torch.ones(40, 1)}, {"columns": 4}, {"theta": torch.zeros(3)}]
+)
 def test_what_changes_nothing_is_served(scene, objects, given):
     assert DIALECT.unpack(call_of(scene, objects, **given)).splats.features is not None
 

@@ -37,6 +37,10 @@ SERVED = {
     "a value that nobody reads": {"values": "image, radii, touched"},
     "a value without a name": {"values": "image, radii, _"},
     "confidence": {"settings": ", confidence=pc.confidence"},
+    "a camera that is trained": {
+        "settings": ", projmatrix_raw=viewpoint_camera.projection_matrix",
+        "arguments": ", theta=viewpoint_camera.turned, rho=viewpoint_camera.moved",
+    },
 }
 
 
@@ -80,6 +84,7 @@ SAME = {
     "half by another name": ("depth", STORED.format(Z, "z * alpha * T")),
     "by a name of two values": (None, STORED.format(W + Z + "float w = alpha;", "w * z")),
     "by a name that changes": (None, STORED.format(W + Z + "w *= 2;", "w * z")),
+    "in the buffer of the newer rasterizer": ("invdepth", INVERSE.replace("out_inv", "inv")),
     "beside another depth": ("depth", DEPTH + "out_median_depth[pix_id] = M;"),
     "what light is left": ("alpha", "T = test_T; out_alpha[pix_id] = 1 - T;"),
     "what light another left": (None, "T = test_T * x; out_alpha[pix_id] = 1 - T;"),
@@ -454,6 +459,14 @@ NOT_RESUMED = {
         "state, at = torch.load(checkpoint)\n        gaussians.restore(state)\n        at = 0",
     ),
     "a lost parameter": ("self.poses)", "self.masks)"),
+    "more than is taken back": (
+        "training_setup(training_args)\n\n    def construct",
+        "training_setup(training_args)\n        self._xyz, rest = model_args\n\n    def construct",
+    ),
+    "a set": (
+        "(self._xyz, self._scaling, *values, self.optimizer.state_dict(), self.poses)",
+        "{self._xyz, self._scaling, *values, self.optimizer.state_dict(), self.poses}",
+    ),
     "a dict": ("((gaussians.capture(), iteration)", '({"model": gaussians.capture(), "at": 1}'),
     "a removed folder": ("scene = Scene(", "shutil.rmtree(opt.model_path); scene = Scene("),
     "a lost state": ("self.optimizer.state_dict()", "None"),
@@ -555,11 +568,33 @@ def test_pictures_of_a_network_are_not_compared(tmp_path):
         ForkAdapter().drawing(repo, ["--network"])
 
 
+KEYS = '    return {"render"'
+WHOLE = {
+    "unpacked later": "image, radii = whole",
+    "in one of two lengths": (
+        "if len(whole) == 3:\n        image, radii, more = whole\n"
+        "    else:\n        image, radii = whole"
+    ),
+    "by numbers": "image = whole[0]\n    radii = whole[1]",
+}
+
+
+@pytest.mark.parametrize("how", WHOLE)
+def test_a_result_may_be_unpacked_after_the_call(tmp_path, how):
+    later = (KEYS, f"    {WHOLE[how]}\n{KEYS}")
+    repo = fork(tmp_path, ("image, radii = rasterizer(", "whole = rasterizer("), later)
+    assert errors(repo) == []
+    (names,) = read_fork(repo).outputs.values()
+    assert [each.name for each in names] == ["image", "radii", "more"][: len(names)]
+    assert len(names) == (3 if "more" in WHOLE[how] else 2)
+
+
 STATEMENT = "gaussians.thin_out(mask)"
+MORE = ('package["render"]', 'package["render"] + package["more"]')
 REFUSED = {
     "a setting": ({"settings": ", mult=0.5"}, [], "mult, unknown"),
     "a factor on gradients": ({"settings": ", depth_threshold=1"}, [], "depth_threshold, unknown"),
-    "an argument": ({"arguments": ", theta=pose"}, [], "theta, unknown"),
+    "an argument": ({"arguments": ", turned=pose"}, [], "turned, unknown"),
     "a value used in the renderer": (
         {"values": "image, radii, more"},
         [("    return {", "    image = image + more\n    return {")],
@@ -637,6 +672,31 @@ REFUSED = {
         ],
         "makes opacities from pc.net",
     ),
+    "a copy of the model": (
+        {},
+        [
+            (
+                "    for iteration in range",
+                "    best = deepcopy(gaussians)\n    for iteration in range",
+            )
+        ],
+        "copies its model, deepcopy(gaussians)",
+    ),
+    "a model in several processes": (
+        {},
+        [("    for iteration in range", "    ddp = DDP(gaussians)\n    for iteration in range")],
+        "processes of its own",
+    ),
+    "another framework": (
+        {},
+        [
+            (
+                "from gaussian_renderer import render",
+                "import jittor\nfrom gaussian_renderer import render",
+            )
+        ],
+        "train.py trains by jittor",
+    ),
     "processes": (
         {},
         [
@@ -652,7 +712,16 @@ REFUSED = {
         [(STATEMENT, "gaussians._opacity.data.clamp_(0)")],
         "changes _opacity outside",
     ),
-    "rows changed and read": ({}, [(STATEMENT, f"rows = {STATEMENT}")], "reads what thin_out"),
+    "rows changed and read": (
+        {},
+        [
+            (
+                "        if iteration < opt.densify_until_iter",
+                f"        rows = {STATEMENT}\n        if on",
+            )
+        ],
+        "reads what thin_out",
+    ),
     "a missing group": ({}, [('"name": "scaling"', '"name": "size"')], "no group scaling"),
     "tensors in place of a model": (
         {},
@@ -660,6 +729,25 @@ REFUSED = {
         "a camera and a model",
     ),
     "a whole result": ({}, [("image, radii = rasterizer(", "both = rasterizer(")], "not unpacked"),
+    "a result that is returned at once": (
+        {},
+        [("image, radii = rasterizer(", "return rasterizer(")],
+        "not unpacked",
+    ),
+    "a whole result that is handed on": (
+        {},
+        [("image, radii =", "both ="), (KEYS, f"    image, radii = cut(both), both[1]\n{KEYS}")],
+        "not unpacked",
+    ),
+    "a third of a whole result": (
+        {},
+        [
+            ("image, radii =", "all ="),
+            (KEYS, f'    image, radii, more = all\n{KEYS[:-8]}"more": more, "render"'),
+            MORE,
+        ],
+        "more, read in train.py",
+    ),
     "computed positions": ({}, [("return self._xyz\n", "return self.net()\n")], "computed"),
 }
 
@@ -671,15 +759,33 @@ def test_what_reading_cannot_follow_is_refused_by_name(tmp_path, what):
     assert expected in "; ".join(errors(repo))
 
 
-def test_gradients_that_a_script_clears_are_no_values(tmp_path):
-    cleared = f"{STATEMENT}\n            gaussians._xyz.grad[rows] = 0"
-    assert errors(fork(tmp_path, (STATEMENT, cleared))) == []
+@pytest.mark.parametrize("what", ["_xyz.grad[rows] = 0", "_xyz.requires_grad = False"])
+def test_what_a_script_does_to_gradients_changes_no_values(tmp_path, what):
+    assert errors(fork(tmp_path, (STATEMENT, f"{STATEMENT}\n            gaussians.{what}"))) == []
+
+
+def test_what_a_densification_returns_may_be_read_where_it_ends_before_stage_2(tmp_path):
+    repo = fork(tmp_path, (STATEMENT, f"pruned = {STATEMENT}"))
+    assert errors(repo) == []
+    (held,) = (
+        each for each in ForkAdapter().seams_for(repo) if each.attribute.endswith("thin_out")
+    )
+    with pytest.raises(EngineError, match="thin_out, whose result the host reads"):
+        held.how(SimpleNamespace(seam=held))
 
 
 def test_rows_and_values_stand_still_by_what_methods_do_not_by_their_names(tmp_path):
     seams = ForkAdapter().seams_for(fork(tmp_path))
     still = [each.attribute.split(".")[1] for each in seams if each.role is Role.STILL]
     assert still == ["oneupSHdegree", "thin_out", "spread"]
+
+
+def test_a_method_that_makes_a_model_changes_it_where_it_is_called_in_training(tmp_path):
+    body = "    def set_rows(self, rows):\n        self._xyz = rows\n\n    def capture"
+    changes = ("    def capture", body), ("gaussians.oneupSHdegree()", "gaussians.set_rows(means)")
+    assert read_fork(fork(tmp_path / "in", *changes)).still == ("set_rows", "thin_out", "spread")
+    before = (changes[0], ("    scene = Scene(", "    gaussians.set_rows(1)\n    scene = Scene("))
+    assert "set_rows" not in read_fork(fork(tmp_path / "before", *before)).still
 
 
 def test_joint_learning_needs_to_know_where_the_model_comes_to_rest(tmp_path):

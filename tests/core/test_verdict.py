@@ -96,6 +96,10 @@ REUSED = f"""    seen = pc.get_features
 {CALL}        colors_precomp=colours,
 """
 
+ASKED = """    opacity = pc.get_opacity
+    if getattr(pc, "hidden", None) is not None:
+        opacity = opacity * pc.hidden
+"""
 SHADOW = """    with torch.no_grad():
         _, shadow, _, _ = rasterizer(
             means3D=pc.get_xyz, opacities=pc.net(light), shs=None, colors_precomp=black
@@ -263,6 +267,16 @@ def test_the_nearest_host_is_of_this_family(fork):
         ),
         (END, GSPLAT.format("shs, eps2d=0.0"), "render draws with eps2d=0.0, not 0.3"),
         (END, CHOSEN.replace("{}", " / 2"), "is made into chosen(raw)"),
+        (
+            "    image, radii, depth, used = ",
+            "    dark_image, image, radii, used = ",
+            "its rasterizer returns another picture first, dark_image",
+        ),
+        (
+            "    opacity = pc.get_opacity\n",
+            f"{ASKED}    pc.hidden = rows\n",
+            "opacities from pc.hidden",
+        ),
         ("rotations=rotations\n    )\n", MEAN, "its picture is made into image.mean(dim=0)"),
         ("shs=shs, scales", "mesh_color=mesh, shs=shs, scales", "rasterizer also takes mesh_color"),
         ("{'params': [], 'name': 'f_dc'}", "{'params': [self._opacity]}", "not train positions"),
@@ -299,6 +313,10 @@ def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):
         ("rotations=rotations\n    )\n", "rotations=rotations\n    )\n    image = image[:3]\n"),
         ("rotations=rotations\n    )\n", CLAMPED),
         (END, EXPOSED),
+        ("    opacity = pc.get_opacity\n", ASKED),
+        ("torch.cat(", "jt.concat("),
+        ("= torch.exp", "= jt.exp"),
+        ("    image, radii, depth, used = ", "    counts, radii, image, used = "),
         (CALL, REUSED),
         (
             "class GaussianModel:",
@@ -351,6 +369,12 @@ def test_a_getter_may_compute_under_an_option_that_is_off(fork, tmp_path, asked)
     assert judged(HostRepo(tmp_path)).kind == "finetune"
     groups.write_text(groups.read_text().replace("False", "True"))
     assert "get_scaling is computed" in read_plain(HostRepo(tmp_path)).reasons[0]
+
+
+def test_a_script_that_is_no_python_is_named(fork, tmp_path):
+    repo = fork()
+    (tmp_path / "train.py").write_text("for each in views:\nscene.save(3)\n")
+    assert judged(repo).differs[0] == "train.py is no valid Python (scripts: train.py)"
 
 
 def test_what_is_never_saved_or_drawn_is_not_plain(fork, tmp_path):
