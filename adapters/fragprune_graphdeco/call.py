@@ -63,8 +63,8 @@ class CallInSource(RasterizerCall):
     Attributes:
         settings: names of the settings, in order.
         line: where its result is assigned.
-        names: of the unpacked values, in order; "" where one is no plain name. Empty if the result
-            is not unpacked.
+        names: of the values, unpacked at the call or later, in order; "" where one is no plain
+            name. Empty if that was not read.
         given: arguments and settings by name.
     """
 
@@ -106,7 +106,7 @@ def read_calls(repo: HostRepo, module: str, function: str) -> list[CallInSource]
     names = _settings(made[0]) if made else {}  # type: ignore[arg-type]
     if not names:
         return []
-    drawn = list(_drawn(imported, body)) or [(body.lineno, imported.package(made[0]), (), {})]
+    drawn = list(_drawn(imported, body)) or [(body.lineno, imported.package(made[0]), (), (), {})]
     return [
         CallInSource(
             frozenset(names) - set(SHARED),
@@ -116,10 +116,10 @@ def read_calls(repo: HostRepo, module: str, function: str) -> list[CallInSource]
             package,
             tuple(names),
             line,
-            unpacked,
+            unpacked or taken,
             given | names,
         )
-        for line, package, unpacked, given in sorted(drawn, key=lambda each: each[0])
+        for line, package, unpacked, taken, given in sorted(drawn, key=lambda each: each[0])
     ]
 
 
@@ -132,8 +132,10 @@ def _settings(made: ast.Call) -> dict[str, ast.expr]:
 
 def _drawn(
     imported: _Imported, body: Function
-) -> Iterator[tuple[int, str, tuple[str, ...], dict[str, ast.expr]]]:
-    """Line, package, names of the values and arguments of every call of the rasterizer."""
+) -> Iterator[tuple[int, str, tuple[str, ...], tuple[str, ...], dict[str, ast.expr]]]:
+    """Line, package, names of the values, of those that are taken of them later, and arguments of
+    every call of the rasterizer.
+    """
     assigned = [node for node in nodes(body) if isinstance(node, ast.Assign)]
     targets = {id(node.value): node.targets[0] for node in assigned}
     rasterizers = {
@@ -154,7 +156,8 @@ def _drawn(
             yield (
                 target.lineno,
                 imported.package(made),
-                tuple(values) or _taken(body, getattr(target, "id", "")),
+                tuple(values),
+                _taken(body, getattr(target, "id", "")),
                 {each.arg: each.value for each in [*keywords, *node.keywords] if each.arg},
             )
 
