@@ -78,7 +78,7 @@ OTHERWISE = {
         "gaussians = OtherModel(",
         "train.py makes OtherModel",
     ),
-    "is no Python": ("loss.backward()", "loss.backward(", "no script that trains"),
+    "is no Python": ("loss.backward()", "loss.backward(", "train.py is no valid Python"),
     "steps twice": ("loss.backward()", "loss.backward(); more.backward()", "2 places that go back"),
 }
 
