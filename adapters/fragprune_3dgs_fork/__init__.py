@@ -250,7 +250,7 @@ class ForkDialect(GraphdecoDialect):
         return {name: module for name, module in made.items() if name in self.names()}
 
 
-def asked(call: SeamCall) -> NoReturn:
+def no_result(call: SeamCall) -> NoReturn:
     """In place of a densification whose result the host reads, where the model stands still."""
     raise EngineError(
         f"{call.seam.attribute}, whose result the host reads",
@@ -326,7 +326,7 @@ class ForkAdapter(GraphdecoAdapter):
             of(Role.KEEP, "_prune_optimizer"),
             of(Role.APPEND, "cat_tensors_to_optimizer"),
             *(
-                of(Role.STILL, each, asked if each in fork.answering else None)
+                of(Role.STILL, each, no_result if each in fork.answering else None)
                 for each in fork.still
             ),
             of(Role.SAVE, "save_ply"),

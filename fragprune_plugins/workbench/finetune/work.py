@@ -41,7 +41,7 @@ _say = partial(click.echo, err=True)
 OTHER_SCENE = 12.0
 """dB of PSNR below which photographs are those of another scene, or over another background.
 
-A grey picture reaches about as much; a model of 100 iterations more.
+Plain grey reaches 7 to 13 dB on five scenes, black instead of a white background 2 dB on one.
 """
 
 
