@@ -127,7 +127,7 @@ def test_a_model_that_was_better_as_it_came_is_told_what_may_help(drop, more, ad
 
 @pytest.mark.parametrize(
     ("keep", "left", "why"),
-    [(0.6, {36}, ""), ("visible", {*range(54)}, "which reached no pixel of the 9 views.")],
+    [(0.6, {36}, ""), ("visible", {*range(54)}, "which reached no pixel of any view.")],
 )
 def test_gaussians_are_removed_before_learning(scene, words, out, keep, left, why):
     """Which, and that no picture changes where none was visible, is measure's to say."""

@@ -33,10 +33,12 @@ from fragprune_plugins.workbench.figures.evaluate import (
     measure_all,
 )
 from fragprune_plugins.workbench.figures.recorded import Recorded
-from fragprune_plugins.workbench.figures.wording import describe, frames, headlines, outcome
+from fragprune_plugins.workbench.figures.wording import begun, describe, frames, headlines, outcome
 from fragprune_plugins.workbench.finetune.api import finetune
+from fragprune_plugins.workbench.finetune.trial import Trial
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.report import page as report_page
+from fragprune_plugins.workbench.run.work import Looking
 from fragprune_plugins.workbench.scenes.dataset import load_dataset
 
 HOST = Path(__file__).with_name("host") / "train.py"
@@ -86,8 +88,9 @@ def demo(*, out: Path, iters: int, seed: int, engine: EngineOptions) -> Report:
     report = run_demo(out, settings, partial(click.echo, err=True))
     larger = report["larger"]
     table = describe({"original": report["before"], "pruned": report["after"]})
+    told = [outcome("run", report, report["control"]), *begun(report)]
     text = (
-        f"\n{table}\n\n{outcome('run', report, report['control'])}\n"
+        f"\n{table}\n\n" + "\n".join(told) + "\n"
         f"Of larger pictures, {larger['size']}: {frames(larger['before'], larger['after'])}.\n"
         f"Took {report['seconds']:.0f} s. Open {out / 'index.html'} for the pictures. "
         f"To turn it: fragprune view {out}"
@@ -131,7 +134,7 @@ def run_demo(
 
     Returns:
         The report. "before", "after" and "control" are measurements on held-out views; the control
-        trains opacities alone for as many iterations. "seconds_by_part" are wall times.
+        learned for as many iterations without cutoffs. "seconds_by_part" are wall times.
 
     Raises:
         OutputError: the folder cannot be written, or holds files that no demo wrote.
@@ -152,7 +155,11 @@ def run_demo(
             f"every Gaussian for {settings.finetune}"
         )
         learning = Settings(iterations=settings.finetune, seed=settings.seed)
-        options = RunOptions(settings=learning, engine=settings.engine, device=settings.device)
+        engine = EngineOptions(settings.engine, settings.device)
+        looking = Looking(engine)
+        options = RunOptions(
+            settings=learning, engine=engine.name, device=engine.device, look=looking
+        )
         summary = run(command, options)
     assert summary.model_before is not None  # the host saves at its last iteration
     assert summary.model_after is not None
@@ -166,7 +173,7 @@ def run_demo(
     with _timed(seconds, "measure"):
         say("3/4  Measuring on the held-out views")
         candidates = [Candidate(each) for each in (before, after, control)]
-        report = _measure(scene, candidates, settings, summary)
+        report = _measure(scene, candidates, settings, summary, looking.trial)
     with _timed(seconds, "pictures"), claiming(out, "pictures", "index.html", "model"):
         say("4/4  Drawing the pictures")
         report["files"] = write_page(
@@ -182,7 +189,11 @@ def run_demo(
 
 
 def _measure(
-    scene: Path, candidates: list[Candidate], settings: DemoSettings, summary: RunSummary
+    scene: Path,
+    candidates: list[Candidate],
+    settings: DemoSettings,
+    summary: RunSummary,
+    trial: Trial | None,
 ) -> dict[str, Any]:
     """Figures of the original, the pruned model and the control, on held-out views."""
     shots = load_dataset(scene).test
@@ -191,12 +202,8 @@ def _measure(
         "before": before,
         "after": after,
         "control": zero,
-        "fragments_ratio": before["fragments_per_pixel"] / max(after["fragments_per_pixel"], 1e-9),
-        "frame_ratio": before["frame_ms"] / max(after["frame_ms"], 1e-9),
-        "psnr_change": after["psnr"] - before["psnr"],
-        "control_psnr_change": zero["psnr"] - before["psnr"],
-        "ssim_change": after["ssim"] - before["ssim"],
-        "gaussians": after["gaussians"],
+        "keep": trial and trial.keep,
+        "forgotten": trial and trial.forgotten,
         "engine": after["engine"],
         "device": after["device"],
         "iterations": summary.steps,
@@ -258,7 +265,7 @@ def write_page(
         title="The same picture from fewer fragments",
         facts=headlines(report, report["control"]),
         quote=outcome("run", report, report["control"]),
-        notes=[],
+        notes=begun(report),
         table=report_page.figures(
             {"original": report["before"], "control": report["control"], "pruned": report["after"]}
         ),

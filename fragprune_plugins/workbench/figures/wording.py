@@ -228,13 +228,11 @@ def next_steps(model: Path | None, folder: Path, scene: Path | None = None) -> s
     return f"{look}A page to share: fragprune report {folder}{data}"
 
 
-def begun(data: dict[str, Any], removed: int, views: int = 0) -> list[str]:
+def begun(data: Mapping[str, Any]) -> list[str]:
     """Lines on what came before the first step of a fine-tuning: its trial, and Gaussians removed.
 
     Args:
-        data: its figures, with "settings", "before", "keep" and "forgotten".
-        removed: number of Gaussians.
-        views: that were looked at for --keep visible.
+        data: its figures, with "settings", "before", "after", "keep" and "forgotten".
     """
     lines, dropout, keep = [], data["settings"]["dropout"], data["keep"]
     if data["forgotten"] is not None and dropout:
@@ -245,9 +243,9 @@ def begun(data: dict[str, Any], removed: int, views: int = 0) -> list[str]:
     if keep is not None:
         why = "those whose removal changed the training views and views beside them least"
         if keep == "visible":
-            why = f"which reached no pixel of the {views} views"
-        whole = data["before"]["gaussians"]
-        lines.append(f"Removed {removed:,} of {whole:,} Gaussians before learning, {why}.")
+            why = "which reached no pixel of any view"
+        whole, left = (data[each]["gaussians"] for each in ("before", "after"))
+        lines.append(f"Removed {whole - left:,} of {whole:,} Gaussians before learning, {why}.")
     return lines
 
 

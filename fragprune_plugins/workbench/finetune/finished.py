@@ -58,7 +58,6 @@ class Finetuned:
         asked: the command's options, with what a trial chose.
         start: the model as it came in.
         forgotten: dB that a trial made other photographs worse; None without a trial.
-        removed: Gaussians that went before learning.
         found: what a search for the strongest truncation found; None without one.
         truncated: the result has thresholds, here or in another process.
         shards: processes that hold a part of the Gaussians each; 1 where each holds them all.
@@ -68,7 +67,6 @@ class Finetuned:
     start: Candidate
     result: FinetuneResult
     forgotten: float | None
-    removed: int
     found: Bounded | None
     truncated: bool
     shards: int = 1
@@ -102,7 +100,7 @@ class Finetuned:
             configuration: by which the same command is known again.
         """
         data, asked, result = self._data(figures), self.asked, self.result
-        text = self._text(data, len(dataset.test), len(dataset.train) + len(dataset.test))
+        text = self._text(data, len(dataset.test))
         more: dict[str, Any] = {"curves": [asdict(point) for point in result.curves]}
         if asked.itself:
             more["cameras"] = asked.scene.as_record(asked.cameras)
@@ -152,7 +150,7 @@ class Finetuned:
         data["control"] = control or records.control_of(data, records.files(asked.out.parent))
         return data
 
-    def _text(self, data: dict[str, Any], held_out: int, views: int) -> str:
+    def _text(self, data: dict[str, Any], held_out: int) -> str:
         """What a person reads."""
         result, settings, before = self.result, self.result.settings, data["before"]
         pressure = f" at pressure {data['pressure']:.2g}" if settings.goal.presses else ""
@@ -175,7 +173,7 @@ class Finetuned:
         if result.interrupted:
             of = f"{data['iterations']} of {settings.iterations}"
             lines.append(f"Interrupted at {of} iterations. {_goes_on(self.found)}")
-        lines += wording.begun(data, self.removed, views)
+        lines += wording.begun(data)
         plain = data["untruncated"]
         if plain is not None:
             lines.append(describe_untruncated(before, plain))

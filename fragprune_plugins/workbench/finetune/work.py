@@ -165,7 +165,6 @@ def _learned(opened: _Opened, ranks: Ranks, lost: float | None) -> tuple[Finetun
         start,
         result,
         forgotten=lost,
-        removed=len(whole) - len(left),
         found=found,
         truncated=ranks.gather(saved.falloff is not None)[0],
         shards=ranks.size if asked.shard else 1,

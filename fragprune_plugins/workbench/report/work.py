@@ -62,7 +62,8 @@ def report(*, folder: Path, out: Path | None, data: Path | None, engine: EngineO
         pictures = Path(name)
         drawn, learning, missing = _draw(main, folder, pictures, data, partial(open_engine, engine))
         more = [*learning, *_files(every, folder, pictures)]
-        notes = [*([_ONLY_CONTROLS] if control else []), *([missing] if missing else [])]
+        begun = wording.begun(main.data) if _compared(main) else []
+        notes = [*begun, *([_ONLY_CONTROLS] if control else []), *([missing] if missing else [])]
         text = report_page.compose(
             report_page.TEMPLATE,
             drawn,
@@ -182,9 +183,15 @@ def _of(record: Record, folder: Path) -> str:
 def _facts(record: Record, among: Sequence[Path]) -> list[tuple[str, str]]:
     """The three figures of a fine-tuning that was measured; else none."""
     data = record.data
-    if record.command not in ("run", "finetune") or not (data.get("before") and data.get("after")):
+    if not _compared(record):
         return []
     return wording.headlines(data, data.get("control") or records.control_of(data, among))
+
+
+def _compared(record: Record) -> bool:
+    """Whether it is of a fine-tuning, measured before and after."""
+    data = record.data
+    return record.command in ("run", "finetune") and bool(data.get("before") and data.get("after"))
 
 
 def _settings(record: Record) -> list[list[str]]:

@@ -175,7 +175,7 @@ def _describe(
     lines = [wording.describe(wording.columns_of(data)), ""] if data["after"] else []
     if data["before"]:
         lines.append(wording.outcome("run", data, data["control"]))
-        lines += wording.begun(data, data["before"]["gaussians"] - data["after"]["gaussians"])
+        lines += wording.begun(data)
     else:
         if data["after"] and not control:
             lines.append(_CONTROL)
