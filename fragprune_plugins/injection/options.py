@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -17,8 +17,9 @@ from fragprune_plugins.learning.schedule import Settings
 Stage = Literal["auto", "finetune", "joint", "off"]
 
 
-Look = Callable[[Path, Photographs, Settings], tuple[Settings, Tensor | None]]
-"""Is given the PLY of stage 1, its photographs, and the settings that were asked for.
+Look = Callable[[Path, Photographs, Mapping[str, Any], Settings], tuple[Settings, Tensor | None]]
+"""Is given the PLY of stage 1, its photographs, fields of ``RasterInputs`` with which the host
+draws it, and the settings that were asked for.
 
 It gives those to learn with, and (N,) bool, the Gaussians that stage 2 begins with; None for all.
 """
@@ -43,8 +44,8 @@ class RunOptions:
             result already, nothing runs. If an earlier run of the same command finished stage 1
             and not stage 2, "auto" begins with stage 2.
         trust: go on where the host's own rasterizer draws otherwise than our engine.
-        look: is called before stage 2 resumes a model whose PLY alone, by vanilla's rules, shows
-            what the host draws; None learns as asked.
+        look: is called before stage 2 resumes a model whose PLY alone shows what the host draws;
+            None learns as asked.
     """
 
     adapter: str | None = None

@@ -211,8 +211,6 @@ class Stages:
     def _look(self, checkpoint: Path) -> tuple[Settings, Tensor | None]:
         """What a look at the model of stage 1 gives; what was asked for without one.
 
-        Other rules of drawing than vanilla's are not known to whoever looks.
-
         Args:
             checkpoint: that the host resumes.
         """
@@ -221,10 +219,8 @@ class Stages:
             return asked
         try:
             photographs = self.adapter.photographs(self.repo, self.host.arguments)
-            own_rules = self.adapter.drawing(self.repo, self.host.arguments)
+            drawing = self.adapter.drawing(self.repo, self.host.arguments)
         except NotComparedError:
-            return asked
-        if own_rules:
             return asked
         if not starting.holds(checkpoint, self.before):
             log.warning(
@@ -234,7 +230,7 @@ class Stages:
                 self.before,
             )
             return asked
-        return look(self.before, photographs, self.options.settings)
+        return look(self.before, photographs, drawing, self.options.settings)
 
     def _execute(
         self,

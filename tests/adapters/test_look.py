@@ -29,6 +29,7 @@ RESUMED = {
     "lp-3dgs": ("train.py",),
     "mcmc": ("train.py", "--cap_max", 170),
     "mini-splatting": ("ms/train.py", "--imp_metric", "indoor", "--simp_iteration1", 8),
+    "mip-splatting": ("train.py",),
     "rain-gs": ("train.py",),
     "speedy-splat": ("train.py", "--prune_until_iter", 0),
     "vanilla-3dgs": ("train.py",),
@@ -42,9 +43,9 @@ class Looked:
     def __init__(self):
         self.seen = []
 
-    def __call__(self, ply, photographs, settings):
-        self.seen.append((ply, photographs, settings))
-        kept = torch.arange(len(load(ply))) % 2 == 0
+    def __call__(self, ply, photographs, drawing, settings):
+        self.seen.append((ply, photographs, drawing, settings))
+        kept = torch.arange(len(load(ply, filtered=True))) % 2 == 0
         return replace(settings, dropout=0.25), kept
 
 
@@ -73,7 +74,9 @@ def test_stage_two_begins_with_the_gaussians_that_are_kept(host, photographs, tm
     words = runs.command(folder / script, photographs, tmp_path / "out", 10, *ENDED, *more)
     summary = run(words, replace(OPTIONS, look=look))
     assert [seen[0] for seen in look.seen] == [summary.model_before]
-    before, after = load(summary.model_before), load(summary.model_after)
+    before, after = (
+        load(ply, filtered=True) for ply in (summary.model_before, summary.model_after)
+    )
     for name in FROZEN:
         assert torch.equal(getattr(after, name), getattr(before, name)[::2]), name
     store, info = sidecar.load(summary.model_after)
@@ -102,11 +105,11 @@ def test_a_stage_two_that_a_look_changed_is_finished_when_asked_again(trained):
     assert not run(trained, other).already_finished
 
 
-def test_nobody_looks_before_other_rules_of_drawing(photographs, tmp_path):
+def test_a_look_is_told_by_which_rules_the_host_draws(photographs, tmp_path):
     script, look = runs.written(HOSTS["mip-splatting"], tmp_path / "host") / "train.py", Looked()
-    words = runs.command(script, photographs, tmp_path / "out", 10, *ENDED)
+    words = runs.command(script, photographs, tmp_path / "out", 10, *ENDED, "--kernel_size", 0.2)
     run(words, replace(OPTIONS, look=look))
-    assert look.seen == []
+    assert [drawing for _, _, drawing, _ in look.seen] == [{"dilation": 0.2, "compensation": "mip"}]
 
 
 def test_a_checkpoint_with_other_gaussians_than_the_ply_is_resumed_whole(

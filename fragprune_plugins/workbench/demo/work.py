@@ -155,11 +155,9 @@ def run_demo(
             f"every Gaussian for {settings.finetune}"
         )
         learning = Settings(iterations=settings.finetune, seed=settings.seed)
-        engine = EngineOptions(settings.engine, settings.device)
-        looking = Looking(engine)
-        options = RunOptions(
-            settings=learning, engine=engine.name, device=engine.device, look=looking
-        )
+        at = EngineOptions(settings.engine, settings.device)
+        looking = Looking(at)
+        options = RunOptions(settings=learning, engine=at.name, device=at.device, look=looking)
         summary = run(command, options)
     assert summary.model_before is not None  # the host saves at its last iteration
     assert summary.model_after is not None
@@ -167,8 +165,7 @@ def run_demo(
     before, after = (models.load(path, device=settings.device) for path in pair)
     with _timed(seconds, "control"):
         say(f"2/4  The control: the same {settings.finetune} iterations without cutoffs")
-        learning = replace(learning, goal=Control())
-        given = before, load_dataset(scene), learning
+        given = before, load_dataset(scene), replace(learning, goal=Control())
         control = finetune(*given, engine=settings.engine, progress=True).model
     with _timed(seconds, "measure"):
         say("3/4  Measuring on the held-out views")

@@ -8,19 +8,22 @@ from __future__ import annotations
 import contextlib
 import logging
 import sys
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import click
 from torch import Tensor
 
+from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import FragpruneError
 from fragprune_plugins.files import records
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.injection import launch
 from fragprune_plugins.injection.process import current_gpu
 from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.types import RasterInputs, RasterOutputs
 from fragprune_plugins.workbench.commands.command import JSON, Report
 from fragprune_plugins.workbench.commands.logs import Bar, logging_steps
 from fragprune_plugins.workbench.commands.opening import bound_threads, open_engine
@@ -225,20 +228,22 @@ class Looking:
     trial: Trial | None = None
 
     def __call__(
-        self, ply: Path, photographs: Photographs, settings: Settings
+        self, ply: Path, photographs: Photographs, drawing: Mapping[str, Any], settings: Settings
     ) -> tuple[Settings, Tensor | None]:
         """Make the trial of ``fragprune finetune``, and score the Gaussians as it does."""
         try:
-            return self._look(ply, photographs, settings)
+            return self._look(ply, photographs, drawing, settings)
         except FragpruneError as error:  # the host may read and draw more than we do
             log.warning("not tried whether it knows its photographs by heart, because of %s", error)
             return settings, None
 
     def _look(
-        self, ply: Path, photographs: Photographs, settings: Settings
+        self, ply: Path, photographs: Photographs, drawing: Mapping[str, Any], settings: Settings
     ) -> tuple[Settings, Tensor | None]:
-        engine, device = open_engine(self.engine)
-        model, dataset = load(ply, device=device), load_photographs(photographs).to(device)
+        rasterizer, device = open_engine(self.engine)
+        engine = _AsTheHost(rasterizer.name, rasterizer, drawing)
+        model = load(ply, filtered=True, device=device)
+        dataset = load_photographs(photographs).to(device)
         trial, left = tried(model, dataset, settings, engine=engine, say=log.info), None
         if trial.keep is not None:
             shots = dataset.train
@@ -246,3 +251,15 @@ class Looking:
             left = kept(model, trial.keep, shots, views, engine=engine).cpu()
         self.trial = trial
         return trial.settings, left
+
+
+@dataclass
+class _AsTheHost:
+    """Draws with an engine, by a host's rules: these fields of ``RasterInputs``."""
+
+    name: str
+    engine: Engine
+    drawing: Mapping[str, Any]
+
+    def rasterize(self, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
+        return self.engine.rasterize(replace(inputs, **self.drawing), thresholds)
