@@ -269,6 +269,10 @@ def _check_script(fork: Fork, script: str) -> None:
     owners = "|".join(map(re.escape, sorted(_owners(tree)))) or "-"
     if copied := re.search(rf"\bdeepcopy\(({owners})\)", ast.unparse(tree)):
         fork.refuse("script", script, f"copies its model, {copied[0]}", "the one that it makes")
+    if size := _size(fork.repo, script):
+        found = f"draws pictures of another size than the camera's, {size}"
+        expected = "the camera's: stage 2 would begin with the first of its sizes again"
+        fork.refuse("script", script, found, expected)
     if several := _trainings(fork.repo, reading.module_of(script)):
         fork.refuse("script", script, *several)
     compared = [node for node in nodes(tree) if isinstance(node, ast.Compare)]
@@ -285,6 +289,25 @@ def _check_script(fork: Fork, script: str) -> None:
     if any(each in nodes(outer)[1:] for each in counted for outer in loops):
         fork.refuse("script", script, "a training in a loop", "one training")
     fork.one_run = fork.one_run or _not_resumed(fork.repo, script, tree)
+
+
+def _size(repo: HostRepo, script: str) -> str:
+    """What a script gives a drawing function for the size of its pictures; "" for nothing."""
+    trees = reading.reached(repo, [reading.module_of(script)], RENDERER).values()
+    calls = [each for tree in trees for each in nodes(tree) if isinstance(each, ast.Call)]
+    for name in graphdeco.drawing_functions(repo, RENDERER):
+        parameters = repo.parameters(RENDERER, name) or ()
+        given = [call.given for call in graphdeco.read_calls(repo, RENDERER, name)]
+        sizes = [each.get(key) for each in given for key in ("image_height", "image_width")]
+        read = {each.id for size in sizes for each in nodes(size) if isinstance(each, ast.Name)}
+        for call in (each for each in calls if getattr(each.func, "id", "") == name):
+            passed = dict(zip(parameters, call.args, strict=False))
+            passed |= {each.arg: each.value for each in call.keywords if each.arg}
+            for parameter, value in passed.items():
+                camera = _CAMERA.match(parameter) or parameter == parameters[0]
+                if parameter in read and not camera and not is_off(value):
+                    return f"{parameter}={ast.unparse(value)}"
+    return ""
 
 
 def _is_loop(node: ast.AST) -> bool:

@@ -593,6 +593,15 @@ STATEMENT = "gaussians.thin_out(mask)"
 MORE = ('package["render"]', 'package["render"] + package["more"]')
 REFUSED = {
     "a setting": ({"settings": ", mult=0.5"}, [], "mult, unknown"),
+    "a size of its own": (
+        {},
+        [
+            ("chosen=None", "chosen=None, size=None"),
+            ("image_height=0", "image_height=size[0] if size else 0"),
+            ("pipe, background)", "pipe, background, size=photograph.shape[1:])"),
+        ],
+        "another size than the camera's, size=photograph.shape[1:]",
+    ),
     "a factor on gradients": ({"settings": ", depth_threshold=1"}, [], "depth_threshold, unknown"),
     "an argument": ({"arguments": ", turned=pose"}, [], "turned, unknown"),
     "a value used in the renderer": (
