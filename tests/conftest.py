@@ -44,6 +44,14 @@ def _without_waiting_for_the_disk():
         yield
 
 
+@pytest.fixture
+def tmp_path(tmp_path: Path) -> Path:
+    """A folder alone in its folder: a run whose host is unknown reads the one above, too."""
+    folder = tmp_path / "alone"
+    folder.mkdir()
+    return folder
+
+
 @pytest.fixture(scope="session")
 def photographs(tmp_path_factory):
     """The demo's room, very small."""
