@@ -13,7 +13,7 @@ from fragprune_plugins.workbench.view import site as serving
 SITE = {"index.html": b"<p>here", "model-0.splats": bytes(range(7)), "photographs/0000.jpg": b"jpg"}
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def port():
     server = serving.open_server(SITE)
     thread = Thread(target=server.serve_forever)
