@@ -219,16 +219,6 @@ def test_ctrl_c_keeps_a_portable_model_though_it_has_no_thresholds(photographs, 
     assert sidecar.load(saved.with_name("point_cloud.ply"))[0].neutral
 
 
-def test_a_finished_ply_without_a_checkpoint_is_enough(photographs, trained):
-    before = {p for p in trained.rglob("*") if p.is_file()}
-    summary = run(command(photographs, trained, 10), replace(OPTIONS, stage="finetune"))
-    assert summary.steps == 8
-    old, new = read_ply(summary.model_before), read_ply(summary.model_after)
-    assert torch.equal(old.xyz, new.xyz)
-    made = {p.name for p in trained.rglob("*") if p.is_file()} - {p.name for p in before}
-    assert made == {"point_cloud.fragprune.safetensors"}
-
-
 @pytest.mark.parametrize("end", ["return", "sys.exit(0)"])
 def test_a_host_that_learns_and_draws_nothing_is_an_error_however_it_ends(
     photographs, tmp_path, end

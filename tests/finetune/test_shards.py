@@ -93,25 +93,6 @@ def test_each_process_draws_its_view_of_all_gaussians_to_the_bit(size, truncated
             assert torch.equal(gradient, leaf.grad), name
 
 
-def test_the_oracle_draws_shards_as_it_draws_the_whole():
-    """Nothing of it is particular to the cpu engine."""
-    engine = create_engine("reference")
-
-    def work(ranks):
-        tensors = leaves(ranks, True)
-        outputs = draw(ShardedEngine(engine, ranks), tensors, ranks.rank)
-        return outputs.image.detach(), {k: v.grad for k, v in tensors.items()}
-
-    parts = learn(2, work)
-    together = leaves(Ranks(), True)
-    for (image, _), index in zip(parts, (0, 1), strict=True):
-        expected = draw(engine, together, index)
-        assert torch.allclose(image, expected.image, atol=1e-6)
-    for name, leaf in together.items():
-        gradient = torch.cat([grads[name] for _, grads in parts])
-        assert torch.allclose(gradient, leaf.grad, rtol=1e-4, atol=1e-5), name
-
-
 def test_a_process_whose_gaussians_nobody_sees_takes_part():
     """All lie behind every camera; and one process may have none at all."""
 
