@@ -12,6 +12,7 @@ from miniatures.lp_3dgs import LPHost
 from miniatures.runs import check_stage_two, edit, miniature, written
 from miniatures.speedy_splat import SpeedyHost
 from miniatures.vanilla_3dgs import joint, running
+from plyfile import PlyData
 
 from fragprune_compact_3dgs import Compact3DGS
 from fragprune_lp_3dgs import LP3DGS
@@ -122,6 +123,16 @@ def test_compact_is_known_by_its_codebooks_and_hash_grid(tmp_path):
     edit(written(CompactHost, tmp_path) / "scene/gaussian_model.py", "recolor", "colours")
     findings = Compact3DGS().match(HostRepo(tmp_path)).findings
     assert "no recolor" in str(findings[0])
+
+
+def test_compact_learns_in_the_later_part_of_its_run(compact, photographs, tmp_path):
+    options = replace(OPTIONS, stage="finetune", from_iter=10)
+    summary = run(command(compact, photographs, tmp_path, 16), options)
+    store, info = sidecar.load(summary.model_after)
+    assert (info.adapter, summary.steps) == ("compact-3dgs", 5)
+    assert len(store) == info.rows == len(PlyData.read(summary.model_after)["vertex"].data)
+    assert not store.neutral
+    assert summary.fragments_after < summary.fragments_before
 
 
 def test_compacts_thresholds_follow_their_gaussians_through_the_last_sort(
