@@ -151,7 +151,7 @@ def test_sigterm_in_stage_two_saves_what_was_learned_and_exits_with_143(photogra
 
 
 def test_killed_while_saving_it_starts_again_from_stage_one_and_leaves_nothing(
-    photographs, trained, tmp_path, monkeypatch, single_thread
+    photographs, trained, tmp_path, monkeypatch
 ):
     """The host has written its model, the sidecar is not there yet."""
     finetune = replace(OPTIONS, stage="finetune")

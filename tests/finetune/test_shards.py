@@ -29,11 +29,6 @@ ATTRIBUTES = ("means", "opacities", "scales", "rotations", "sh")
 COUNT = 60
 
 
-@pytest.fixture(autouse=True)
-def one_thread(single_thread):
-    """Forked processes must not inherit threads."""
-
-
 def own(ranks, tensor):
     """This process' rows, by the rule that is documented."""
     start, end = (len(tensor) * rank // ranks.size for rank in (ranks.rank, ranks.rank + 1))
