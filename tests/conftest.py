@@ -24,7 +24,7 @@ settings.register_profile(
 )
 settings.load_profile("fragprune")
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ["OMP_NUM_THREADS"] = "1"
 for _variable in ("FRAGPRUNE_BLOCK", "FRAGPRUNE_ONLY"):
     os.environ.pop(_variable, None)
 
@@ -36,12 +36,28 @@ def _frozen():
     gc.freeze()
 
 
+@pytest.fixture(autouse=True)
+def _one_thread():
+    """Torch on one: the same sums in the same order, and no thread that a forked process misses."""
+    yield
+    if torch := sys.modules.get("torch"):
+        torch.set_num_threads(1)  # whatever the test asked for
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _without_waiting_for_the_disk():
     """Only a power cut would lose what the system has not written yet."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda _: None)
         yield
+
+
+@pytest.fixture
+def tmp_path(tmp_path: Path) -> Path:
+    """A folder alone in its folder: a run whose host is unknown reads the one above, too."""
+    folder = tmp_path / "alone"
+    folder.mkdir()
+    return folder
 
 
 @pytest.fixture(scope="session")
@@ -52,17 +68,6 @@ def photographs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene")
     make_scene(folder, views=6, width=40, points=150)
     return folder
-
-
-@pytest.fixture
-def single_thread():
-    """Torch on one thread: the same sums in the same order."""
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from cli.commands import run_json
-from miniatures.runs import OPTIONS, check_measured, check_stage_two, command, miniature
+from miniatures.runs import OPTIONS, check_measured, command, miniature
 from miniatures.surfels import SurfelHost
 from miniatures.vanilla_3dgs import Notes, joint
 
@@ -83,13 +83,6 @@ def trained(mini, photographs, tmp_path_factory):
 
 def read(path):
     return SurfelSplatting().read_model(path)
-
-
-def test_stage_two_moves_opacities_and_thresholds_alone(trained):
-    summary, _, _ = trained
-    check_stage_two(summary, "2dgs", read=read)
-    assert read(summary.model_before).scaling.shape == (summary.gaussians, 2)
-    assert summary.gaussians != 150  # it densified
 
 
 def test_we_measure_the_picture_that_the_hosts_own_script_renders(mini, trained, photographs):

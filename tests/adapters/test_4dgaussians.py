@@ -13,14 +13,13 @@ import torch
 from miniatures import runs
 from miniatures.moving import MovingHost
 from miniatures.vanilla_3dgs import Notes
-from PIL import Image
 from scenes import blended
 
 from fragprune_4dgaussians import MovingGaussians
 from fragprune_4dgaussians.config import PythonFile
 from fragprune_plugins.errors import HostFailed, HostNeedsError, ModelFileError, UsageError
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.injection.launch import run
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.testing.host import joint, running
 from fragprune_plugins.workbench.models import model as models
@@ -116,15 +115,6 @@ def test_a_stage_2_that_would_freeze_the_coarse_phase_is_refused(mini, photograp
     assert not list((tmp_path / "out").rglob("point_cloud.ply"))
 
 
-def test_joint_learning_counts_fine_iterations_and_follows_rows(mini, photographs, tmp_path):
-    options = replace(OPTIONS, stage="joint", from_iter=3)
-    summary = run(command(mini, photographs, tmp_path / "out"), options)
-    store, _ = sidecar.load(summary.model_after)
-    assert summary.steps == LAST - 1
-    assert store.steps == LAST - 1 - 3
-    assert len(store) == summary.gaussians != 150
-
-
 def test_a_newer_checkpoint_of_the_first_phase_is_no_start(mini, photographs, output):
     coarse = output / "chkpnt_coarse_6.pth"
     os.utime(coarse)
@@ -180,19 +170,6 @@ def test_a_host_that_starts_itself_again_fails(mini, photographs, tmp_path):
     words = command(mini, photographs, tmp_path / "out", "--nan_at", 3)
     with pytest.raises(HostFailed, match="start itself again"):
         run(words, replace(OPTIONS, stage="off"))
-
-
-def test_its_render_script_draws_with_thresholds(mini, photographs, output):
-    summary = run(command(mini, photographs, output), replace(OPTIONS, stage="finetune"))
-    words = [str(mini / "render.py"), "-m", str(output), "--skip_train", "--iteration"]
-    drawn = []
-    for thresholds in (True, False):
-        if not thresholds:
-            summary.model_after.with_suffix(".fragprune.safetensors").unlink()
-        run([*words, str(LAST + 9)], RunOptions(device="cpu", stage="off"))
-        (picture,) = (output / "test" / f"ours_{LAST + 9}" / "renders").glob("*.png")
-        drawn.append(Image.open(picture).tobytes())
-    assert drawn[0] != drawn[1]
 
 
 # -- configuration ---------------------------------------------------------------------------------
@@ -268,12 +245,6 @@ def test_the_file_wins_and_stage_2_still_ends_where_it_should(
     assert load(tmp_path / "out" / f"chkpnt_fine_{LAST}.pth")[1] == LAST
     assert network(summary.model_after)["grid_planes"].shape == (4, 4)
     assert config.read_text() == text
-
-
-def test_one_run_saves_its_model_where_the_file_ends_it(mmcv, mini, photographs, config, tmp_path):
-    words = command(mini, photographs, tmp_path / "out", "--configs", config, iterations=1000)
-    summary = run(words, replace(OPTIONS, stage="joint", from_iter=3))
-    assert summary.model_after.parent.name == f"iteration_{LAST}"
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # mmcv's own

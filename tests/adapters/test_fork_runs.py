@@ -27,11 +27,9 @@ def fork(tmp_path):
     return root
 
 
-@pytest.mark.parametrize("last", [False, True], ids=["rates first", "rates last"])
-def test_a_fork_is_trained_and_pruned(fork, photographs, tmp_path, last):
-    if last:
-        edit(fork / "train_scene.py", RATES, "")
-        edit(fork / "train_scene.py", STEP, STEP + RATES.replace("        ", " " * 16))
+def test_a_fork_that_sets_its_rates_last_is_trained_and_pruned(fork, photographs, tmp_path):
+    edit(fork / "train_scene.py", RATES, "")
+    edit(fork / "train_scene.py", STEP, STEP + RATES.replace("        ", " " * 16))
     words = runs.command(fork / "train_scene.py", photographs, tmp_path / "out", 12)
     summary = run(words, OPTIONS)
     check_stage_two(summary, "3dgs-fork")

@@ -6,7 +6,7 @@ import pytest
 import torch
 from miniatures import runs
 from miniatures.mcmc import MCMCHost
-from miniatures.runs import OPTIONS, check_stage_two, miniature
+from miniatures.runs import OPTIONS, miniature
 from miniatures.vanilla_3dgs import joint
 
 from fragprune_mcmc import MCMC
@@ -36,26 +36,12 @@ def test_parents_of_a_relocation_are_not_taken_for_those_of_a_later_append(mini)
         assert (values[-2:] < 1e-12).all()  # neutral: nobody's children
 
 
-# -- stage 2 -------------------------------------------------------------------------------------
+# -- files over the command line -----------------------------------------------------------------
 
 
 def command(mini, scene, out, iterations, *more):
     words = runs.command(mini / "train.py", scene, out, iterations, "--noise_lr", 5e7)
     return [*words, *map(str, more)]
-
-
-CAP = ("--cap_max", 170)
-
-
-def test_train_then_finetune_moves_no_frozen_bit(mini, photographs, tmp_path):
-    """The schedule of relocation lasts into stage 2, and the noise would go on for ever."""
-    more = (*CAP, "--densify_until_iter", 99)
-    summary = run(command(mini, photographs, tmp_path / "out", 12, *more), OPTIONS)
-    check_stage_two(summary, "mcmc")
-    assert 150 < summary.gaussians <= 170
-
-
-# -- files over the command line -----------------------------------------------------------------
 
 
 def test_what_stage_two_changes_wins_over_the_configuration_file(mini, photographs, tmp_path):

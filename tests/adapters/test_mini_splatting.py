@@ -91,7 +91,7 @@ def command(mini, variant, scene, out, iterations, *more):
     return [str(word) for word in (*words, *TINY, *FLAGS[variant], *more)]
 
 
-@pytest.fixture(scope="module", params=FLAGS)
+@pytest.fixture(scope="module", params=["gs", "ms_d"])  # of ms, test_look
 def trained(request, mini, photographs, tmp_path_factory):
     """16 iterations: split by mask, all points from depth at 6, simplified at 10 and at 13."""
     out = tmp_path_factory.mktemp(request.param)

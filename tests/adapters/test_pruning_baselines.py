@@ -65,13 +65,6 @@ def test_stage_two_of_speedy_prunes_nothing(speedy, photographs, tmp_path):
 # -- LP-3DGS -------------------------------------------------------------------------------------
 
 
-def test_lp_ends_in_its_own_error_and_stage_two_begins_from_what_it_saved(
-    lp, photographs, tmp_path, caplog
-):
-    check_stage_two(run(command(lp, photographs, tmp_path, 11), OPTIONS), "lp-3dgs", 6)
-    assert "ours_30000" in caplog.text
-
-
 def test_lp_prunes_by_the_weights_of_what_is_drawn(lp, photographs, tmp_path):
     """bw_score at iteration 12: 70 % stay; in stage 2, which passes it again, all do."""
     words = command(lp, photographs, tmp_path, 10, "--prune_method", "mini_splatting")

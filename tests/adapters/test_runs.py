@@ -151,7 +151,7 @@ def test_sigterm_in_stage_two_saves_what_was_learned_and_exits_with_143(photogra
 
 
 def test_killed_while_saving_it_starts_again_from_stage_one_and_leaves_nothing(
-    photographs, trained, tmp_path, monkeypatch, single_thread
+    photographs, trained, tmp_path, monkeypatch
 ):
     """The host has written its model, the sidecar is not there yet."""
     finetune = replace(OPTIONS, stage="finetune")
@@ -217,16 +217,6 @@ def test_ctrl_c_keeps_a_portable_model_though_it_has_no_thresholds(photographs, 
         run(command(photographs, trained, 10), PORTABLE)
     (saved,) = trained.glob("point_cloud/*/*.safetensors")
     assert sidecar.load(saved.with_name("point_cloud.ply"))[0].neutral
-
-
-def test_a_finished_ply_without_a_checkpoint_is_enough(photographs, trained):
-    before = {p for p in trained.rglob("*") if p.is_file()}
-    summary = run(command(photographs, trained, 10), replace(OPTIONS, stage="finetune"))
-    assert summary.steps == 8
-    old, new = read_ply(summary.model_before), read_ply(summary.model_after)
-    assert torch.equal(old.xyz, new.xyz)
-    made = {p.name for p in trained.rglob("*") if p.is_file()} - {p.name for p in before}
-    assert made == {"point_cloud.fragprune.safetensors"}
 
 
 @pytest.mark.parametrize("end", ["return", "sys.exit(0)"])

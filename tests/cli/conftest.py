@@ -5,7 +5,7 @@ from fragprune_plugins.workbench.models.formats.ply import write_ply
 
 
 @pytest.fixture
-def scene(tmp_path, single_thread):
+def scene(tmp_path):
     """Photographs and a model of them; processes that are forked must not inherit threads."""
     data, path, _ = tiny.scene(tmp_path)
     return data, path

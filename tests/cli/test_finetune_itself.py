@@ -97,25 +97,6 @@ def test_thresholds_learn_from_its_first_step():
     assert not Schedule(Settings(iterations=9000)).at(1).learn
 
 
-def test_the_lines_say_against_what(scene, cameras, tmp_path):
-    _, path, _ = scene
-    out = tmp_path / "out.ply"
-    arguments = ("finetune", path, "--self", "--cameras", cameras, "--out", out, "--iters", 20)
-    text = run(*arguments).stdout
-    assert "dB PSNR against itself on 3 views that were held out. No photograph was used." in text
-    assert "PSNR to itself, dB equal" in " ".join(text.split())
-    assert "control" not in text
-    assert "inf" not in text
-    assert "Warning" not in text
-
-
-def test_a_page_of_it_can_be_made(scene, cameras, tmp_path):
-    _, path, _ = scene
-    finetuned(path, tmp_path / "out.ply", "--cameras", cameras)
-    assert "against itself" in run_json("report", tmp_path)["result"]
-    assert "PSNR to itself, dB" in (tmp_path / "report.html").read_text()
-
-
 @pytest.mark.parametrize("falloff", [None, 0.4])
 def test_the_target_is_what_the_model_shows_as_it_came_in(scene, falloff):
     """Truncated if it was: without its thresholds a pruned model is another picture."""

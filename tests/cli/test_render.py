@@ -25,9 +25,7 @@ def test_held_out_views(cut_scene, tmp_path):
 
 
 @pytest.mark.parametrize("size", [2, 3])
-def test_gaussians_divided_among_processes_give_the_same_pictures(
-    cut_scene, tmp_path, size, single_thread
-):
+def test_gaussians_divided_among_processes_give_the_same_pictures(cut_scene, tmp_path, size):
     data, path = cut_scene
     words = ("render", path, "--data", data, "--out")
     one, many = tmp_path / "one", tmp_path / "many"
@@ -42,7 +40,7 @@ def test_gaussians_divided_among_processes_give_the_same_pictures(
         assert report[name] == pytest.approx(whole[name]), name
 
 
-def test_a_film_is_not_drawn_by_several_processes(cut_scene, tmp_path, single_thread):
+def test_a_film_is_not_drawn_by_several_processes(cut_scene, tmp_path):
     data, path = cut_scene
     film = tmp_path / "film.mp4"
     ended = command(2, "render", path, "--data", data, "--out", film, "--shard-gaussians")

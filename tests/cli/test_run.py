@@ -23,11 +23,6 @@ from fragprune_plugins.workbench.run import work
 WORDS = ["--device", "cpu", "--iters", 6]
 
 
-@pytest.fixture(autouse=True)
-def _one_thread(single_thread):
-    """Small pictures are drawn fastest by one."""
-
-
 @pytest.fixture(scope="module")
 def scene(photographs):
     return photographs

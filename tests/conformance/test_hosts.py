@@ -29,8 +29,9 @@ def relative(
     return type("Relative", (RelativeConformance,), stated)
 
 
-FEW = {"examples": 5, "longest_order": 1}
-TestGaussianSplattingMCMC = relative("gaussian-splatting", MCMCHost)
+SAME_SOURCE = {"test_refuse": None}  # it reads nothing else
+FEW = {"examples": 5, "longest_order": 1} | SAME_SOURCE
+TestGaussianSplattingMCMC = relative("gaussian-splatting", MCMCHost, **SAME_SOURCE)
 TestSurfels = relative("2dgs")
 Test4DGaussians = relative("4dgaussians")
 TestCompact3DGS = relative("compact-3dgs")

@@ -16,16 +16,6 @@ def model():
     return tiny.cut(tiny.random_model(), torch.linspace(0.01, 0.5, 60))
 
 
-def test_what_was_saved_comes_back_from_one_file(model, tmp_path):
-    fp.save(str(tmp_path / "a.ply"), model)
-    assert [each.name for each in tmp_path.iterdir()] == ["a.ply"]
-    (tmp_path / "a.ply").rename(tmp_path / "b.ply")
-    read = fp.load(str(tmp_path / "b.ply"))
-    assert all(torch.equal(each, model.tensors[name]) for name, each in read.tensors.items())
-    assert torch.equal(read.falloff, model.falloff)
-    assert fp.load(tmp_path / "b.ply", truncation=False).thresholds is None
-
-
 def test_learned_thresholds_come_back_to_the_bit(model, tmp_path):
     model.thresholds.logits.grad = torch.linspace(-1, 1, 60)
     model.thresholds.step()

@@ -19,7 +19,7 @@ import json, sys
 from pathlib import Path
 from fragprune_plugins.workbench.demo import folder
 from fragprune_plugins.workbench.demo.work import DemoSettings, run_demo
-settings = DemoSettings(iterations=60, finetune=30, views=12, width=48, points=400)
+settings = DemoSettings(iterations=30, finetune=12, views=12, width=48, points=400)
 print(json.dumps(run_demo(Path(sys.argv[1]), settings)))
 """
 
@@ -51,7 +51,7 @@ def test_report_has_the_names_of_every_report(demo):
             *("frame_ms", "frame_ms_se"),
         } <= report[side].keys()
     assert report["after"]["fragments_per_pixel"] < report["before"]["fragments_per_pixel"]
-    assert report["iterations"] == 30
+    assert report["iterations"] == 12
     assert report["keep"] is not None
     assert report["after"]["gaussians"] < report["before"]["gaussians"]
     assert report["adapter"] == "vanilla-3dgs"

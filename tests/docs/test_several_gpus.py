@@ -5,7 +5,6 @@ import runpy
 import sys
 from pathlib import Path
 
-import pytest
 import torch
 from finetune import tiny
 from finetune.several import launch
@@ -14,11 +13,6 @@ import fragprune_plugins as fp
 from fragprune_plugins.files.ply import read_ply
 
 HOW_TO = Path(__file__).parents[2] / "docs" / "how-to"
-
-
-@pytest.fixture(autouse=True)
-def one_thread(single_thread):
-    """Forked processes must not inherit threads."""
 
 
 def test_the_lines_in_python_run_in_each_process(tmp_path, monkeypatch):

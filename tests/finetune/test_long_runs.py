@@ -74,5 +74,5 @@ def test_memory_is_flat_and_thresholds_do_not_drift(tmp_path):
 @pytest.mark.slow
 @pytest.mark.timeout(7200)
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="reads /proc")
-def test_nor_over_fifty_thousand_steps(tmp_path, single_thread):
+def test_nor_over_fifty_thousand_steps(tmp_path):
     require_calm(50_000, tmp_path)

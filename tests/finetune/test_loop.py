@@ -11,7 +11,7 @@ from fragprune_plugins import Control, Faster, Fewer, Pressure, ThresholdStore, 
 from fragprune_plugins.adapting import RasterInputs
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import AlignmentError, DivergedError, UsageError
-from fragprune_plugins.learning.schedule import USUAL_STOP, Schedule, Settings
+from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.targets import calibrate
 from fragprune_plugins.workbench.finetune import faster, loop
 
@@ -127,14 +127,6 @@ def test_rules_are_trained_with_from_the_first_step_and_kept(model, dataset, tru
     assert again.model.rules == {"stop": 0.2, "rim": "soft"}
 
 
-@pytest.mark.parametrize("stop", [None, "auto"])
-def test_the_usual_stop_is_drawn_from_the_first_step_and_goes_with_the_model(model, dataset, stop):
-    engine, usual = Noting(), USUAL_STOP if stop else None
-    result = finetune(model, dataset, Settings(iterations=2, stop=stop), engine=engine)
-    assert [seen[0] for seen in engine.seen if seen[2]] == 2 * [usual]
-    assert result.model.stop == usual
-
-
 def test_target_is_met_on_training_views(model, dataset):
     target = 2.0
     result = finetune(model, dataset, Settings(iterations=80, goal=Fewer(target)))
@@ -151,14 +143,6 @@ def test_the_bar_says_when_it_warms_up(model, dataset, capsys):
     finetune(model, dataset, settings, schedule=Schedule(settings, warmup=2), progress=True)
     names = [line.split(":")[0] for line in capsys.readouterr().err.split("\r") if "px" in line]
     assert list(dict.fromkeys(names)) == ["warm-up", "fine-tuning"]
-
-
-def test_interrupted(model, dataset, monkeypatch):
-    tiny.at_loss(monkeypatch, 6, KeyboardInterrupt)
-    result = finetune(model, dataset, Settings(iterations=50))
-    assert result.interrupted
-    assert result.progress.steps == 5
-    assert not torch.equal(result.model.opacity, model.opacity)
 
 
 def test_divergence_that_no_loss_shows_is_noticed_before_there_is_a_result(model, dataset):

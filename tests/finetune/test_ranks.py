@@ -24,11 +24,6 @@ from fragprune_plugins.workbench.ranks import Ranks, fingerprint, launched, spea
 ALL = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
 
 
-@pytest.fixture(autouse=True)
-def one_thread(single_thread):
-    """Forked processes must not inherit threads."""
-
-
 def learned(model, dataset, settings, ranks=None):
     """Everything that a fine-tuning leaves, as plain values."""
     result = finetune(model, dataset, settings, engine="cpu", ranks=ranks)

@@ -62,7 +62,7 @@ def require_same(one, other):
     ids=["all", "opacity", "dropout", "target", "control", "portable"],
 )
 def test_cut_off_again_and_again_it_ends_as_if_never_cut(
-    model, dataset, tmp_path, monkeypatch, single_thread, settings
+    model, dataset, tmp_path, monkeypatch, settings
 ):
     path, told = tmp_path / "out.fragprune-unfinished", []
     whole = run(model, dataset, settings)
@@ -76,9 +76,7 @@ def test_cut_off_again_and_again_it_ends_as_if_never_cut(
     require_same(whole, result)
 
 
-def test_a_target_time_that_was_cut_off_keeps_what_was_timed(
-    model, dataset, tmp_path, monkeypatch, single_thread
-):
+def test_a_target_time_that_was_cut_off_keeps_what_was_timed(model, dataset, tmp_path, monkeypatch):
     tiny.exact_clock(monkeypatch)
     settings, path = Settings(iterations=STEPS, goal=Faster(1.2)), tmp_path / "unfinished"
 
@@ -103,7 +101,7 @@ def test_photographs_are_read_once_and_a_changed_one_is_noticed(tmp_path, monkey
     assert asked() != first
 
 
-def test_a_warm_up_that_was_cut_off_goes_on(model, dataset, tmp_path, monkeypatch, single_thread):
+def test_a_warm_up_that_was_cut_off_goes_on(model, dataset, tmp_path, monkeypatch):
     from fragprune_plugins.learning import schedule
 
     monkeypatch.setattr(schedule, "_LEARNING_STEPS", 4)  # thresholds open after 8 of 12 steps
@@ -117,7 +115,7 @@ def test_a_warm_up_that_was_cut_off_goes_on(model, dataset, tmp_path, monkeypatc
 @pytest.mark.usefixtures("ctrl_c")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_waits_for_the_end_of_its_step_and_is_resumed_from_there(
-    model, dataset, tmp_path, monkeypatch, single_thread, number
+    model, dataset, tmp_path, monkeypatch, number
 ):
     from fragprune_plugins.learning.interruption import sigterm_interrupts
 

@@ -29,11 +29,6 @@ ATTRIBUTES = ("means", "opacities", "scales", "rotations", "sh")
 COUNT = 60
 
 
-@pytest.fixture(autouse=True)
-def one_thread(single_thread):
-    """Forked processes must not inherit threads."""
-
-
 def own(ranks, tensor):
     """This process' rows, by the rule that is documented."""
     start, end = (len(tensor) * rank // ranks.size for rank in (ranks.rank, ranks.rank + 1))
@@ -91,25 +86,6 @@ def test_each_process_draws_its_view_of_all_gaussians_to_the_bit(size, truncated
             assert torch.allclose(gradient, leaf.grad, rtol=0, atol=1e-6 * scale), name
         else:
             assert torch.equal(gradient, leaf.grad), name
-
-
-def test_the_oracle_draws_shards_as_it_draws_the_whole():
-    """Nothing of it is particular to the cpu engine."""
-    engine = create_engine("reference")
-
-    def work(ranks):
-        tensors = leaves(ranks, True)
-        outputs = draw(ShardedEngine(engine, ranks), tensors, ranks.rank)
-        return outputs.image.detach(), {k: v.grad for k, v in tensors.items()}
-
-    parts = learn(2, work)
-    together = leaves(Ranks(), True)
-    for (image, _), index in zip(parts, (0, 1), strict=True):
-        expected = draw(engine, together, index)
-        assert torch.allclose(image, expected.image, atol=1e-6)
-    for name, leaf in together.items():
-        gradient = torch.cat([grads[name] for _, grads in parts])
-        assert torch.allclose(gradient, leaf.grad, rtol=1e-4, atol=1e-5), name
 
 
 def test_a_process_whose_gaussians_nobody_sees_takes_part():

@@ -32,7 +32,7 @@ def scene(count):
     return replace(splat, thresholds=ThresholdStore.from_falloff(torch.linspace(0.02, 0.4, count)))
 
 
-def test_the_kernels_draw_shards_as_they_draw_the_whole(device, single_thread):
+def test_the_kernels_draw_shards_as_they_draw_the_whole(device):
     engine = CudaEngine(device, deterministic=True)
     pictures, gradients = drawn(engine, scene(40), (0, 1))
 

@@ -23,8 +23,6 @@ from fragprune_vanilla_3dgs import Vanilla3DGS
 HOOKS = [name for name in vars(hookspecs) if name.startswith("fragprune_")]
 DOCS = Path(__file__).parents[2] / "docs"
 
-pytestmark = pytest.mark.usefixtures("single_thread")
-
 
 class Recorder:
     """Observes everything."""

@@ -20,8 +20,6 @@ from fragprune_plugins.plugins.loading import Plugins
 from fragprune_plugins.workbench.check.work import models_of
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
-pytestmark = pytest.mark.usefixtures("single_thread")
-
 COUNT = 60
 MATCHES = [Match(name, True) for name in ("a-host", "b-host")]
 

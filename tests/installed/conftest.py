@@ -11,11 +11,6 @@ from fragprune_plugins.testing.host import running
 DRIVERS = {"gaussian-splatting": GaussianSplattingHost, "gsplat": GsplatHost}
 
 
-@pytest.fixture(autouse=True)
-def _one_thread(single_thread):
-    """Bit-identical runs need sums in one order."""
-
-
 @pytest.fixture
 def session_on():
     """``session_on(adapter, settings)``: the installed host under a session, its modules fresh.

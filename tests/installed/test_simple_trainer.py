@@ -30,7 +30,7 @@ def release(request, monkeypatch):
 
 
 @pytest.fixture
-def train(tmp_path, single_thread):
+def train(tmp_path):
     """``train(*words, stage=...)``: the script's command."""
 
     def command(*words, strategy="default", settings=None, **options):

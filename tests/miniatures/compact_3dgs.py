@@ -216,13 +216,7 @@ class Added:
         np.savez_compressed(path + "_pp", *self._stored())
 
     def load_model(self, path):
-        packed = [path + ending for ending in ("_pp.npz", ".npz") if Path(path + ending).is_file()]
-        if not packed:
-            return self.load_ply(path)
-        stored = [torch.tensor(part) for part in np.load(packed[0]).values()]
-        *tensors, self.recolor.params.data, self.mlp_head.params.data = stored
-        self._adopt(dict(zip(("xyz", "opacity", "scaling", "rotation"), tensors, strict=True)))
-        return None
+        self.load_ply(path)
 
     def load_ply(self, path):
         vertex = PlyData.read(path + ".ply")["vertex"]  # noqa: F821

@@ -81,11 +81,6 @@ def run_script(words: list[str], session: Session, *, activated: bool) -> None:
             forget_modules(HOST, known)
 
 
-def identity(model: Any) -> torch.Tensor:
-    """(N,) the number each row carries in its red coefficient, which hosts copy to children."""
-    return kit.Host().marks(model)
-
-
 def tensors(model: Any) -> dict[str, torch.Tensor]:
     """Copies of the model's parameters by the names of its optimizer groups."""
     return kit.tensors(kit.Host(), model)

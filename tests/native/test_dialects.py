@@ -126,16 +126,6 @@ def test_larger_scenes_equal_the_oracle_closely(engine: CpuEngine, kind: str) ->
         expect_oracle(engine, case, thresholds)
 
 
-def test_the_largest_weight_wins_wherever_it_lies(engine: CpuEngine) -> None:
-    scene = scenes.footprints_of(scenes.stack([0.5, 0.25, 0.125]))
-    scene.splats.means2d[:] = 8.0
-    scene.splats.depths[:] = torch.tensor([3.0, 2.0, 1.0])
-    scene.splats.opacities[:] = torch.tensor([0.5, 0.5, 0.5])  # a half, a quarter, an eighth
-    assert engine.rasterize(replace(scene, scores=True), None).winners[8, 8] == 2
-    scene.splats.opacities[:] = torch.tensor([0.5, 2 / 3, 0.25])  # a quarter, a half, an eighth
-    assert engine.rasterize(replace(scene, scores=True), None).winners[8, 8] == 1
-
-
 def test_scores_and_features_change_nothing_else(engine: CpuEngine) -> None:
     inputs = scenes.random_scene(4, 200, 61, 43)
     features = torch.rand(200, 5, generator=torch.Generator().manual_seed(0))

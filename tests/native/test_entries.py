@@ -60,7 +60,7 @@ def test_what_an_opaque_tile_hides_is_on_no_list_that_is_blended():
     assert entries(stack) < 16 * 2000 / 2
 
 
-def test_more_threads_count_the_same_and_pairs_fit_their_entries(single_thread):
+def test_more_threads_count_the_same_and_pairs_fit_their_entries():
     inputs = scenes.random_scene(3, 300, 90, 70)
     found = []
     for threads in (1, 2):

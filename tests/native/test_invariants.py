@@ -47,9 +47,7 @@ def assert_identical(first: dict[str, torch.Tensor], second: dict[str, torch.Ten
     [{}, {"features": 2, "offsets": True}, {"rim": "soft"}, {"flat": True}],
     ids=["plain", "extras", "soft rim", "surfels"],
 )
-def test_threads_and_runs_do_not_change_a_bit(
-    engine: CpuEngine, single_thread: None, kind: dict
-) -> None:
+def test_threads_and_runs_do_not_change_a_bit(engine: CpuEngine, kind: dict) -> None:
     inputs = replace(scenes.random_scene(3, **LARGE, **kind), absolute_gradient="features" in kind)
     thresholds = scenes.random_thresholds(3, LARGE["n"])
     alone = everything(engine, inputs, thresholds)

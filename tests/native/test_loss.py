@@ -66,26 +66,18 @@ def agrees(library, image, target, **weight):
     torch.testing.assert_close(gradient.double(), by_image, rtol=0, atol=1e-5 * largest)
 
 
-@pytest.mark.parametrize("size", SIZES)
-def test_any_size(library, size):
-    agrees(library, *pair("strangers", *size, channels=2))
-
-
-@pytest.mark.parametrize("channels", [1, 4])
-def test_any_number_of_channels(library, channels):
-    agrees(library, *pair("strangers", 20, 30, channels))
-
-
 @pytest.mark.parametrize(
-    "kind", ["smooth", "on white", "flat", "nearly equal", "out of range", "black"]
+    ("kind", "shape", "weight"),
+    [
+        *(("strangers", (*size, 2), {}) for size in SIZES),
+        *(("strangers", (20, 30, channels), {}) for channels in (1, 4)),
+        *((kind, (), {}) for kind in ("smooth", "on white", "flat", "nearly equal")),
+        *((kind, (), {}) for kind in ("out of range", "black")),
+        *(("smooth", (), {"ssim_weight": weight}) for weight in (0.0, 1.0, 0.7)),
+    ],
 )
-def test_pictures_that_differ_much_or_little(library, kind):
-    agrees(library, *pair(kind))
-
-
-@pytest.mark.parametrize("weight", [0.0, 1.0, 0.7])
-def test_each_part_for_itself(library, weight):
-    agrees(library, *pair("smooth"), ssim_weight=weight)
+def test_value_and_gradient_are_the_oracles(library, kind, shape, weight):
+    agrees(library, *pair(kind, *shape), **weight)
 
 
 def test_equal_pictures_lose_nothing_and_pull_nowhere(library):

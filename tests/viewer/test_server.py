@@ -13,7 +13,7 @@ from fragprune_plugins.workbench.view import site as serving
 SITE = {"index.html": b"<p>here", "model-0.splats": bytes(range(7)), "photographs/0000.jpg": b"jpg"}
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def port():
     server = serving.open_server(SITE)
     thread = Thread(target=server.serve_forever)
@@ -80,6 +80,7 @@ def test_an_address_that_is_none_gets_an_answer_and_no_traceback(port, path, cap
 
 
 def test_a_browser_that_goes_away_is_not_worth_a_word(capfd):
+    others = threading.enumerate()
     with serving.open_server({"index.html": bytes(64 << 20)}) as server:
         thread = Thread(target=server.serve_forever)
         thread.start()
@@ -93,7 +94,7 @@ def test_a_browser_that_goes_away_is_not_worth_a_word(capfd):
         server.shutdown()
         thread.join()
     for thread in threading.enumerate():  # of the answers that nobody reads
-        if thread is not threading.current_thread():
+        if thread not in others:
             thread.join(timeout=5)
     assert "Traceback" not in capfd.readouterr().err
 
