@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from fragprune_plugins.errors import UnknownHostError
 from fragprune_plugins.hosts.adapter import HostAdapter, ScriptAdapter
 from fragprune_plugins.hosts.findings import Finding, Match
-from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.hosts.source import HostRepo, imported
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def locate(
 
     If no adapter finds a seam in it, but its scripts import an installed host, or ``name`` is the
     adapter of an installed host, the result is the installed package. With ``above`` the folder
-    that contains this one is looked at, too.
+    that contains this one is looked at, too, if scripts here import what lies in it.
     """
     try:
         return repo, choose(repo, adapters, name, select)
@@ -88,11 +88,20 @@ def locate(
         if used and not name and any(each.held for each in attempt(repo, adapters)):
             raise  # a host of its own, that draws by that package
         packages = [package for each in used if (package := HostRepo.installed(each))]
-        outer = [HostRepo(repo.root.parent)] if above else []
-        for candidate in (*outer, *packages):
+        for candidate in (*(_above(repo) if above else ()), *packages):
             with contextlib.suppress(UnknownHostError):
                 return candidate, choose(candidate, adapters, name, select)
         raise
+
+
+def _above(repo: HostRepo) -> list[HostRepo]:
+    """The folder above, if scripts here import what lies in it, as Mini-Splatting's do.
+
+    Of any other nothing is read: it may hold all that its user has.
+    """
+    above = HostRepo(repo.root.parent)
+    used = {name for each in repo.root.glob("*.py") for name in imported(repo.tree(each.stem))}
+    return [above] if any(map(above.path, used)) else []
 
 
 def choose(

@@ -300,3 +300,18 @@ def test_a_host_whose_scripts_import_an_installed_one_is_not_that_host(tmp_path,
     (own.root / "convert.py").write_text("import toyhost_of_tests")
     with pytest.raises(UnknownHostError, match="no adapter fits"):
         locate(own, [Vanilla3DGS(), Installed()])
+
+
+@pytest.mark.parametrize(
+    ("line", "found"), [("from scene import Scene", True), ("import os", False)]
+)
+def test_the_folder_above_is_read_if_a_script_uses_it(tmp_path, line, found):
+    host = skeleton(tmp_path)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "train.py").write_text(line)
+    inner, adapters = HostRepo(tmp_path / "mine"), load_plugins().adapters
+    if found:
+        assert locate(inner, adapters)[0].root == host.root
+        return
+    with pytest.raises(UnknownHostError):
+        locate(inner, adapters)
