@@ -130,11 +130,15 @@ class Fork:
         """Whether the model has a method of this name."""
         return method in _methods(self.repo)
 
+    @property
+    def options_in(self) -> tuple[str, ...]:
+        """The modules that give options and attributes of the model their defaults."""
+        return ("arguments", MODEL, *map(reading.module_of, self.scripts))
+
     def is_off(self, name: str) -> bool:
         """Whether an option or an attribute of the model is None or False by default."""
-        modules = ("arguments", MODEL, *map(reading.module_of, self.scripts))
-        values = [each for m in modules for each in reading.defaults(self.repo, m, name)]
-        return bool(values) and all(map(is_off, values))
+        given = [e for each in self.options_in for e in reading.defaults(self.repo, each, name)]
+        return bool(given) and all(map(is_off, given))
 
     def refuse(self, code: str, where: str, found: str, expected: str) -> None:
         """Add an error."""
@@ -169,7 +173,7 @@ _known: WeakKeyDictionary[HostRepo, Fork] = WeakKeyDictionary()
 def read_fork(repo: HostRepo) -> Fork:
     """Read a checkout, once; of several scripts only those that can be served, if one can."""
     if repo not in _known:
-        fork = _read(repo, reading.training_scripts(repo, "*train*.py", "*/*train*.py"))
+        fork = _read(repo, reading.training_scripts(repo, *reading.SCRIPTS, "*/*train*.py"))
         if fork.errors and len(fork.scripts) > 1:
             alone = {script: _read(repo, (script,)) for script in fork.scripts}
             if served := tuple(script for script, each in alone.items() if not each.errors):
@@ -213,8 +217,7 @@ def _read_scripts(fork: Fork, scripts: tuple[str, ...]) -> None:
         ]
         if CLASS in made and len(set(made)) == 1:
             fork.scripts += (script,)
-            if lacking := _lacking(repo, script):
-                found = f"its call of {CLASS} lacks {lacking}, which fails"
+            for found in reading.failing(repo, (script,)):
                 fork.refuse("script", script, found, "a script that runs")
             if len(made) > 1 or _in_loop(tree, CLASS):
                 fork.one_run = f"{script} makes several models"
@@ -228,21 +231,6 @@ def _read_scripts(fork: Fork, scripts: tuple[str, ...]) -> None:
         fork.refuse("other-host", str(repo.root), found, "a *train*.py that makes GaussianModels")
     for script in fork.scripts:
         _check_script(fork, script)
-
-
-def _lacking(repo: HostRepo, script: str) -> str:
-    """A parameter of the model's class that a script's call does not give; "" for none."""
-    function = repo.function(MODEL, f"{CLASS}.__init__")
-    if function is None:
-        return ""
-    own = [each.arg for each in function.args.args[1:]]
-    needed = own[: len(own) - len(function.args.defaults)]
-    for call in repo.calls(reading.module_of(script), CLASS):
-        given = {each.arg for each in call.keywords}
-        several = None in given or any(isinstance(each, ast.Starred) for each in call.args)
-        if absent := [each for each in needed[len(call.args) :] if each not in given]:
-            return "" if several else absent[0]
-    return ""
 
 
 def _networks(repo: HostRepo, script: str) -> set[str]:
@@ -266,7 +254,7 @@ def _check_script(fork: Fork, script: str) -> None:
     if _PROCESSES.search(ast.unparse(tree)):
         found = "it trains in processes of its own"
         fork.refuse("script", script, found, "one process that keeps its files")
-    owners = "|".join(map(re.escape, sorted(_owners(tree)))) or "-"
+    owners = "|".join(map(re.escape, sorted(reading.owners(tree)))) or "-"
     if copied := re.search(rf"\bdeepcopy\(({owners})\)", ast.unparse(tree)):
         fork.refuse("script", script, f"copies its model, {copied[0]}", "the one that it makes")
     if several := _trainings(fork.repo, reading.module_of(script)):
@@ -379,15 +367,15 @@ def rests_after_densification(fork: Fork) -> bool:
         tree = fork.repo.tree(reading.module_of(script))
         inside = _while_densifying(tree)
         for node, name in _method_calls(tree) if tree else ():
-            if name in fork.still and name != "oneupSHdegree" and id(node) not in inside:
+            if name in fork.still and name != "oneupSHdegree" and node not in inside:
                 return False
     return True
 
 
-def _while_densifying(tree: ast.AST | None) -> set[int]:
+def _while_densifying(tree: ast.AST | None) -> set[ast.AST]:
     """What a script does only where it asks for ``densify_until_iter``."""
     return {
-        id(inner)
+        inner
         for node in nodes(tree)
         if isinstance(node, ast.If) and "densify_until_iter" in ast.unparse(node.test)
         for each in node.body
@@ -461,17 +449,18 @@ def _read_methods(fork: Fork) -> None:
     changing -= {each for each in changing if _MAKES.fullmatch(each)} - (trained - set(fork.setups))
     called: dict[str, None] = {}
     for module, tree in fork.trees.items():
-        owners = _owners(tree)
-        statements = {id(each.value) for each in nodes(tree) if isinstance(each, ast.Expr)}
-        early = _while_densifying(tree) if module in map(reading.module_of, fork.scripts) else set()
+        owners = reading.owners(tree)
+        statements = {each.value for each in nodes(tree) if isinstance(each, ast.Expr)}
+        trains = module in map(reading.module_of, fork.scripts)
+        early = _while_densifying(tree) if trains else set[ast.AST]()
         for node, name in _method_calls(tree):
             if name in changing:
                 called[name] = None
                 owner = ast.unparse(node.func.value)  # type: ignore[attr-defined]
                 own = _MODELS.search(owner) or owner.split("[")[0] in owners
-                if own and id(node) in early - statements:
+                if own and node in early - statements:
                     fork.answering |= {name}
-                elif own and id(node) not in statements:
+                elif own and node not in statements:
                     at = fork.repo.at(module, node.lineno)
                     fork.refuse("row-change", at, f"reads what {name} returns", "a statement")
     fork.still = tuple(name for name in methods if name in called)
@@ -480,15 +469,6 @@ def _read_methods(fork: Fork) -> None:
         place = fork.repo.place(MODEL, f"{CLASS}._prune_optimizer")
         found = "_prune_optimizer keeps other rows than its mask's"
         fork.refuse("row-change", place, found, "[mask]")
-
-
-def _owners(tree: ast.AST) -> set[str]:
-    """Variables, and lists and dicts, that hold models which a script makes."""
-    owners: set[str] = set()
-    for node in nodes(tree):  # in order of depth, so not of the source
-        if isinstance(node, ast.Assign) and f"{CLASS}(" in ast.unparse(node.value):
-            owners |= {ast.unparse(each).split("[")[0] for each in node.targets}
-    return owners
 
 
 def plain_distances(repo: HostRepo) -> bool:
@@ -562,12 +542,16 @@ def _assigned(body: ast.AST, owner: str = "") -> Iterator[tuple[int, str]]:
 def _read_changes(fork: Fork) -> None:
     """A script that changes parameters itself cannot be held still in stage 2."""
     for module, tree in fork.trees.items():
+        early = {getattr(each, "lineno", 0) for each in _while_densifying(tree)}
         for line, name in _assigned(tree):
             at = fork.repo.at(module, line)
-            fork.refuse("row-change", at, f"changes {name} outside the model's methods", "none")
+            if line in early:
+                fork.warn("row-change", at, f"that {at}, which changes {name}, ends before stage 2")
+            else:
+                fork.refuse("row-change", at, f"changes {name} outside the model's methods", "none")
     for script in fork.scripts:
         trained = fork.repo.tree(reading.module_of(script))
-        owners = _owners(trained) if trained else set()
+        owners = reading.owners(trained) if trained else set()
         for node in nodes(trained):
             if isinstance(node, ast.Assign) and _OPTIMIZER.match(ast.unparse(node.value)):
                 name = ast.unparse(node.targets[0])
@@ -680,28 +664,15 @@ def _reached(fork: Fork, node: ast.AST) -> Iterator[str]:
     for kind in ("id", "attr", "name"):
         if isinstance(name := getattr(node, kind, None), str):
             yield name
+    test = node.test if isinstance(node, ast.If) else None
+    taken = reading.decided(fork.repo, fork.options_in, test) if test else None
     for each in ast.iter_child_nodes(node):
-        if isinstance(node, ast.If) and each in node.body and _needs_option(fork, node.test):
+        if taken is not None and each in (node.orelse if taken else node.body):  # type: ignore[attr-defined]
             drawn = graphdeco.drawing_functions(fork.repo, RENDERER)
             if not _mentioned(each).isdisjoint(drawn):
-                tests = [n.attr for n in nodes(node.test) if isinstance(n, ast.Attribute)]
-                fork.options |= {name for name in tests if fork.is_off(name)}
+                fork.options |= {n.attr for n in nodes(test) if isinstance(n, ast.Attribute)}
             continue
         yield from _reached(fork, each)
-
-
-def _needs_option(fork: Fork, test: ast.expr) -> bool:
-    if isinstance(test, ast.BoolOp) and isinstance(test.op, ast.And):
-        return any(_needs_option(fork, each) for each in test.values)
-    return isinstance(test, ast.Attribute) and fork.is_off(test.attr)
-
-
-def _by_default(fork: Fork, node: ast.AST) -> Iterator[ast.AST]:
-    """A script without what it does under an option that is off by default."""
-    yield node
-    for each in ast.iter_child_nodes(node):
-        if not (isinstance(node, ast.If) and each in node.body and _needs_option(fork, node.test)):
-            yield from _by_default(fork, each)
 
 
 def _check_call(fork: Fork, at: str, function: str, call: graphdeco.CallInSource) -> None:
@@ -791,8 +762,9 @@ def _output(fork: Fork, draw: Draw, call: graphdeco.CallInSource, number: int) -
     if "radii" in name:
         return Output(name, "radii")
     output = meaning(fork.repo, call, name)
-    uses = _uses(fork, draw, name) if output.role == "unread" else []
-    if uses and _PROVABLE.search(name) and not kernels.normal_sources(fork.repo, package):
+    uses = _uses(fork, draw, name) if output.role in ("unread", "unproved") else []
+    read = output.role == "unread" and kernels.normal_sources(fork.repo, package)
+    if uses and _PROVABLE.search(name) and not read:
         at = fork.repo.at(RENDERER, call.line)
         fork.warn("rasterizer-output", at, f"what {package} returns as {name}")
         return Output(name, "unproved")
@@ -803,7 +775,7 @@ def _output(fork: Fork, draw: Draw, call: graphdeco.CallInSource, number: int) -
             f"{name}, read in {uses[0]}, whose meaning is unknown",
             "picture, radii, and sums along the ray whose kernel was read",
         )
-    return output
+    return output if output.role != "unproved" else Output(name, "unread")
 
 
 def _uses(fork: Fork, draw: Draw, name: str) -> list[str]:
@@ -841,7 +813,7 @@ def _uses(fork: Fork, draw: Draw, name: str) -> list[str]:
             for inner in ast.walk(node)
         }
         passed |= _only_named(tree)
-        for node in _by_default(fork, tree):
+        for node in reading.by_default(fork.repo, fork.options_in, tree):
             read = isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Load)
             index = node.slice if read else None  # type: ignore[attr-defined]
             if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "get":

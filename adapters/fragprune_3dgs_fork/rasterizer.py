@@ -74,11 +74,17 @@ def meaning(repo: HostRepo, call: graphdeco.CallInSource, name: str) -> Output:
         whole = made is not None and "kInt" in made[0]
         return Output(name, role, column=bool(made and made[1]), integer=whole)
     blended, (moved, flat) = blended_argument(repo, call), _moving(repo, call.package)
+    depths, weights = set(_DEPTH.findall(text)), set(_WEIGHT.findall(text))
+    shares = {f"{depth}/{weight}" for depth in depths for weight in weights}
+    if "T=test_T;" in text:
+        weights.add("1-T")
     if "depth" in name:
-        for rule, known in ((_DEPTH, "depth"), (_INVERSE, "invdepth")):
-            if _written(text, name, "depth", rule):
-                return Output(name, known, detached=flat)  # type: ignore[arg-type]
-    elif re.search(r"alpha|acc|opac", name) and _written(text, name, "alpha|opac", _WEIGHT):
+        inverse = set(_INVERSE.findall(text))
+        known = {"depth": depths, "invdepth": inverse, "unproved": shares}
+        for each, sums in known.items():
+            if _written(text, name, "depth", sums):
+                return Output(name, each, detached=flat)  # type: ignore[arg-type]
+    elif re.search(r"alpha|acc|opac", name) and _written(text, name, "alpha|opac", weights):
         return Output(name, "alpha", detached=flat)
     elif blended and moved is not None and _words(name) & _words(_blended(text)):
         return Output(name, "objects", detached=not moved)
@@ -107,16 +113,13 @@ def _inlined(text: str) -> str:
     return text
 
 
-def _written(text: str, name: str, buffer: str, rule: re.Pattern[str]) -> bool:
-    """Whether a sum, and nothing else, goes into the buffer that is called most like a value."""
+def _written(text: str, name: str, buffer: str, sums: set[str]) -> bool:
+    """Whether sums, and nothing else, go into the buffer that is called most like a value."""
     stored: dict[str, set[str]] = {}
     for own, value in re.findall(rf"\b(?:out_)?(\w*(?:{buffer})\w*)\[pix_id\]=([^;]+);", text):
         stored.setdefault(own, set()).add(value)
     named = [each for each in stored if _words(each) <= _words(name)]
     values = set().union(*(stored[each] for each in named or stored))
-    sums = set(rule.findall(text))
-    if rule is _WEIGHT and "T=test_T;" in text:
-        sums.add("1-T")
     return bool(values) and values <= sums
 
 

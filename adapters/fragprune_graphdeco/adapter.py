@@ -16,13 +16,12 @@ from fragprune_graphdeco.call import RasterizerCall, drawing_functions, read_cal
 from fragprune_graphdeco.densifying import clones, splits
 from fragprune_graphdeco.kernels import SPLAT, Kernel, read_kernels, vendored
 from fragprune_graphdeco.reading import (
-    compiled,
     defaults,
+    failing,
     made_models,
     module_of,
     read_flags,
     read_getters,
-    renamed,
     training_scripts,
 )
 from fragprune_plugins.adapting import (
@@ -289,7 +288,7 @@ class GraphdecoAdapter(ScriptAdapter):
         for module, _, name in (each.rpartition(":") for each in self.own_names):
             module = module or MODEL
             missing += [] if repo.mentions([module], [name]) else [f"no {name} in {module}"]
-        missing += [*renamed(repo), *compiled(repo, self.scripts_of(repo))]
+        missing += failing(repo, self.scripts_of(repo))
         packages = dict.fromkeys([self.package, *(each.package for each in self.calls)])
         return [
             *self.other_host(repo, missing),
@@ -383,8 +382,8 @@ class GraphdecoAdapter(ScriptAdapter):
         """``scripts``; where a checkout has none of them, its own that train one GaussianModel."""
         if any((repo.root / name).is_file() for name in self.scripts):
             return self.scripts
-        trains = training_scripts(repo, "*train*.py")
-        one = (each for each in trains if len(repo.calls(each[:-3], "GaussianModel")) == 1)
+        trains = training_scripts(repo)
+        one = (each for each in trains if len(repo.calls(module_of(each), "GaussianModel")) == 1)
         return tuple(one) or self.scripts
 
     def command_line(self, repo: HostRepo) -> CommandLine:

@@ -14,7 +14,7 @@ from pathlib import Path
 from weakref import WeakKeyDictionary
 
 from fragprune_graphdeco import reading
-from fragprune_graphdeco.call import RASTERIZER, read_calls
+from fragprune_graphdeco.call import ARGUMENTS, RASTERIZER, read_calls
 from fragprune_graphdeco.kernels import ORDER, SPLAT, read_kernels
 from fragprune_graphdeco.reading import ACTIVATIONS, defaults, made_models, returns
 from fragprune_plugins.adapting import (
@@ -47,6 +47,8 @@ _ADDED = re.compile(r"bg_color|zeros_like\(\w+\)$|\* 0\.0$")
 """What is added to a picture and leaves its Gaussians alone: a background, or zeros."""
 _PICTURES = re.compile(r"mesh_\w+|\w+_(rgb|colou?rs?)")
 """Arguments of a rasterizer that are pictures to blend with its own."""
+_RASTERIZER = re.compile(r"(self\.)?\w*rasterizer")
+"""What drawing functions call a rasterizer that they made."""
 _GSPLAT = {
     **{"means": "means3D", "quats": "rotations", "scales": "scales"},
     **{"opacities": "opacities", "colors": "colors_precomp"},
@@ -215,9 +217,10 @@ def _scales(repo: HostRepo, module: str, name: str) -> Iterator[str]:
         each for each in getattr(repo.tree(module), "body", ()) if getattr(each, "name", "") == name
     ]
     for each in (node for model in own for node in nodes(model) if isinstance(node, ast.Assign)):
-        flat = ast.unparse(each.value).endswith(".repeat(1, 2)")
-        if flat and (each in assigned or "scal" in ast.unparse(each.targets[0])):
-            yield f"its Gaussians are flat, with two scales ({repo.at(module, each.lineno)})"
+        wide = re.search(r"\.repeat\(1, ([12])\)$", ast.unparse(each.value))
+        if wide and (each in assigned or "scal" in ast.unparse(each.targets[0])):
+            what = "flat, with two scales" if wide[1] == "2" else "round, with one scale"
+            yield f"its Gaussians are {what} ({repo.at(module, each.lineno)})"
             return
     if made and all(ast.unparse(each.value).endswith("[..., None]") for each in made):
         yield f"its Gaussians are round, with one scale ({repo.at(module, made[0].lineno)})"
@@ -333,8 +336,9 @@ def _terms(node: ast.expr) -> set[str]:
 
 
 def _training(repo: HostRepo) -> list[str]:
-    """Modules of the scripts that train, by their names."""
-    return sorted(each.stem for each in repo.root.glob("*train*.py") if each.stem.isidentifier())
+    """Modules of the scripts that train, by their names, or else by what they do."""
+    named = sorted(each.stem for each in repo.root.glob("*train*.py") if each.stem.isidentifier())
+    return named or [*map(reading.module_of, reading.training_scripts(repo))]
 
 
 def _scripts(repo: HostRepo) -> dict[Path, str]:
@@ -416,7 +420,8 @@ def arguments(call: ast.AST | None) -> dict[str, ast.expr]:
         return {}
     given = {each.arg: each.value for each in call.keywords if each.arg}
     if ast.unparse(call.func).split(".")[-1] != "rasterization":
-        return given
+        drawn = "opacities" in given or _RASTERIZER.fullmatch(ast.unparse(call.func))
+        return given | (dict(zip(ARGUMENTS, call.args, strict=False)) if drawn else {})
     given |= dict(zip(_GSPLAT, call.args, strict=False))
     return {_GSPLAT.get(name, name): value for name, value in given.items()}
 
@@ -713,11 +718,13 @@ class Drawing:
 
     def _channels(self, value: ast.expr) -> Iterator[ast.expr]:
         """What the first channels are, where the picture is cut out of more."""
-        made = self.values.get(getattr(value, "id", ""), [value]) if any(self.cuts()) else [value]
-        for each in made:
+        name = getattr(value, "id", "")
+        for each in self.values.get(name, [value]) if any(self.cuts()) else [value]:
             parts = each.args[:1] if isinstance(each, ast.Call) else []
             listed = parts and isinstance(parts[0], ast.Tuple | ast.List)
-            yield parts[0].elts[0] if listed else each  # type: ignore[attr-defined]
+            first = parts[0].elts[0] if listed else each  # type: ignore[attr-defined]
+            if not listed or getattr(first, "id", "") != name:  # else it is joined to itself
+                yield first
 
     def _beside(self, roots: list[str]) -> bool:
         """Whether these are neither the model as a whole nor other values of its rows."""

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import ast
+import contextlib
+import operator
 import re
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
+from functools import lru_cache
+from typing import Any
 
 from fragprune_plugins.adapting import (
     CommandLine,
@@ -97,9 +102,11 @@ def made_models(repo: HostRepo, module: str) -> list[str]:
 _ELSEWHERE = re.compile(r"\w+(?:\.\w+)*\.(?:scene(?:\.\w+)*|gaussian_renderer)")
 
 
-def renamed(repo: HostRepo) -> list[str]:
-    """Modules of a checkout that its own files import under other names: others, to Python."""
-    return [
+def failing(repo: HostRepo, scripts: Collection[str]) -> list[str]:
+    """Why scripts fail or pass all seams by: modules that are imported under other names, which are
+    others to Python; another framework; compiled training; calls that their functions do not take.
+    """
+    found = [
         f"{path} imports {name}, which is no module of this folder"
         for module in ("gaussian_renderer", "scene", "scene.gaussian_model", "train")
         for node in getattr(repo.tree(module), "body", ())
@@ -108,21 +115,161 @@ def renamed(repo: HostRepo) -> list[str]:
         for path in [repo.at(module, node.lineno)]
         if _ELSEWHERE.fullmatch(name) and not _there(repo, name.split(".")[0])
     ][:1]
+    for script in scripts:
+        tree = repo.tree(module_of(script))
+        found += [f"{script} trains by jittor"] * ("jittor" in imported(tree))
+        found += [
+            f"{script} compiles {node.name}, which trains"
+            for node in nodes(tree)
+            if isinstance(node, ast.FunctionDef)
+            and any("torch.compile" in ast.unparse(each) for each in node.decorator_list)
+            and any(getattr(each, "attr", "") == "backward" for each in nodes(node))
+        ]
+        found += _misfits(repo, module_of(script))[:1]
+    return found
 
 
-def compiled(repo: HostRepo, scripts: Collection[str]) -> list[str]:
-    """Functions that scripts compile, and that go backward, and scripts without torch: no seam is
-    reached in them.
+def owners(tree: ast.AST | None) -> set[str]:
+    """Variables, and lists and dicts, that hold models which a script makes."""
+    return {
+        ast.unparse(each).split("[")[0]
+        for node in nodes(tree)
+        if isinstance(node, ast.Assign) and "GaussianModel(" in ast.unparse(node.value)
+        for each in node.targets
+    }
+
+
+@lru_cache(maxsize=64)  # of the adapters, many ask
+def _misfits(repo: HostRepo, module: str) -> tuple[str, ...]:
+    """Calls of the checkout's own functions with values that these do not take, and of methods
+    that the model lacks; without those that a script tries, or makes only where something is
+    given or asked for.
     """
-    jittor = [each for each in scripts if "jittor" in imported(repo.tree(module_of(each)))]
-    return [f"{script} trains by jittor" for script in jittor] + [
-        f"{script} compiles {node.name}, which trains"
-        for script in scripts
-        for node in nodes(repo.tree(module_of(script)))
-        if isinstance(node, ast.FunctionDef)
-        and any("torch.compile" in ast.unparse(each) for each in node.decorator_list)
-        and any(getattr(each, "attr", "") == "backward" for each in nodes(node))
-    ]
+    tree, misfits = repo.tree(module), tuple[str, ...]()
+    asked = (
+        node
+        for node in nodes(tree)
+        if isinstance(node, ast.Try)
+        or (isinstance(node, ast.If) and isinstance(node.test, ast.Name))
+    )
+    tried = {id(inner) for each in asked for part in each.body for inner in nodes(part)}
+    models, model = owners(tree), _definition(repo, "scene.gaussian_model", "GaussianModel")
+    reached = by_default(repo, ("arguments", module), tree) if tree else ()
+    texts = ast.unparse(tree or ast.Pass()) + ast.unparse(model or ast.Pass())
+    for node in (n for n in reached if isinstance(n, ast.Call) and id(n) not in tried):
+        owner, _, name = ast.unparse(node.func).rpartition(".")
+        found, at = None, repo.at(module, node.lineno)
+        if name in ("capture", "restore"):
+            continue
+        if owner in models and isinstance(model, ast.ClassDef):
+            found = next((n for n in model.body if getattr(n, "name", "") == name), None)
+            inherits = model.bases or "setattr(" in texts or f".{name} = " in texts
+            if found is None and not inherits:
+                misfits += (f"calls {name}, which its model lacks ({at})",)
+        elif not owner and _bindings(tree)[name] == 1:
+            found = model if name == "GaussianModel" else _definition(repo, module, name)
+        if why := _misfit(found, node, bool(owner)):
+            misfits += (f"its call of {name} {why}, which fails ({at})",)
+    return misfits
+
+
+@lru_cache(maxsize=64)
+def _bindings(tree: ast.AST | None) -> Counter[str]:
+    """How often a module gives something a name."""
+    kinds = ("name", "asname", "arg", "id")
+    return Counter(
+        name
+        for node in nodes(tree)
+        if not isinstance(node, ast.keyword)
+        and isinstance(getattr(node, "ctx", ast.Store()), ast.Store)
+        for name in {str(getattr(node, kind, None)) for kind in kinds}
+    )
+
+
+def _definition(repo: HostRepo, module: str, name: str, deep: int = 3) -> ast.stmt | None:
+    """The function or class of a name in a module, also one that it imports from the checkout."""
+    for node in getattr(repo.tree(module), "body", ()):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef) and node.name == name:
+            return node
+        for each in node.names if isinstance(node, ast.ImportFrom) and deep else ():
+            if (each.asname or each.name) == name:
+                return _definition(repo, repo.absolute(module, node), each.name, deep - 1)
+    return None
+
+
+def _misfit(called: ast.AST | None, call: ast.Call, of_model: bool) -> str:
+    """How a call's values differ from those that a function, a method or a class takes; "" if they
+    do not, or if that cannot be told.
+    """
+    made = isinstance(called, ast.ClassDef)
+    own = [n for n in getattr(called, "body", ()) if getattr(n, "name", "") == "__init__"]
+    function = (own[0] if own else None) if made else called
+    given = [each.arg for each in call.keywords]
+    loose = None in given or any(isinstance(each, ast.Starred) for each in call.args)
+    if not isinstance(function, ast.FunctionDef) or function.decorator_list or loose:
+        return ""
+    taken, count = function.args, len(call.args)
+    every = [each.arg for each in (*taken.posonlyargs, *taken.args)]
+    needed = every[: len(every) - len(taken.defaults)]
+    names, needed = (each[made or of_model :] for each in (every, needed))
+    free = [*names[count:], *(each.arg for each in taken.kwonlyargs)]
+    if count > len(names) and not taken.vararg:
+        return f"gives {count} values of {len(names)}"
+    more = [each for each in given if each not in free and not taken.kwarg]
+    lacking = [each for each in needed[count:] if each not in given]
+    return f"gives {more[0]}" if more else f"lacks {lacking[0]}" if lacking else ""
+
+
+_COMPARED = {
+    **{ast.Eq: operator.eq, ast.NotEq: operator.ne, ast.Gt: operator.gt, ast.GtE: operator.ge},
+    **{ast.Lt: operator.lt, ast.LtE: operator.le, ast.Is: operator.is_, ast.IsNot: operator.is_not},
+}
+
+
+def by_default(repo: HostRepo, modules: Collection[str], node: ast.AST) -> Iterator[ast.AST]:
+    """A script without the branches that it does not take where options have their defaults."""
+    yield node
+    taken = decided(repo, modules, node.test) if isinstance(node, ast.If) else None
+    for name, value in ast.iter_fields(node):
+        if taken is not None and name == ("orelse" if taken else "body"):
+            continue
+        for each in value if isinstance(value, list) else [value]:
+            if isinstance(each, ast.AST):
+                yield from by_default(repo, modules, each)
+
+
+def decided(repo: HostRepo, modules: Collection[str], test: ast.expr) -> bool | None:
+    """What a test says where options have the defaults that modules give them; None if it asks for
+    anything else.
+    """
+    if isinstance(test, ast.BoolOp):
+        parts = [decided(repo, modules, each) for each in test.values]
+        ends = isinstance(test.op, ast.Or)
+        return ends if ends in parts else None if None in parts else not ends
+    if isinstance(test, ast.UnaryOp) and isinstance(test.op, ast.Not):
+        inner = decided(repo, modules, test.operand)
+        return None if inner is None else not inner
+    compared = isinstance(test, ast.Compare) and _COMPARED.get(type(test.ops[0]))
+    sides = [test.left, *test.comparators] if isinstance(test, ast.Compare) else [test]
+    values = [_by_itself(repo, modules, each) for each in sides]
+    if not all(values) or not any(isinstance(each, ast.Attribute) for each in sides):
+        return None
+    if len(sides) == 1:
+        return bool(values[0][0])
+    with contextlib.suppress(TypeError):
+        return bool(compared(values[0][0], values[1][0])) if compared and len(sides) == 2 else None
+    return None
+
+
+def _by_itself(repo: HostRepo, modules: Collection[str], node: ast.expr) -> list[Any]:
+    """The one value of a constant, or of an option by default; [] if it is not known."""
+    option = isinstance(node, ast.Attribute)
+    given = [v for m in modules for v in defaults(repo, m, node.attr)] if option else [node]  # type: ignore[attr-defined]
+    try:
+        values = [ast.literal_eval(each) for each in given]
+    except (ValueError, TypeError, SyntaxError):
+        return []
+    return values[:1] if all(repr(each) == repr(values[0]) for each in values) else []
 
 
 def module_of(script: str) -> str:
@@ -209,9 +356,13 @@ def options(repo: HostRepo, module: str, model: str, scripts: Iterable[str]) -> 
     }
 
 
+SCRIPTS = ("*train*.py", "*.py")
+"""Which files of a folder may be training scripts: those of the first that finds any."""
+
+
 def training_scripts(repo: HostRepo, *patterns: str) -> tuple[str, ...]:
     """Scripts that train, the usual one first, by the first of the patterns that finds any."""
-    for pattern in patterns:
+    for pattern in patterns or SCRIPTS:
         files = sorted(repo.root.glob(pattern), key=lambda each: (each.stem != "train", each))
         paths = [each.relative_to(repo.root) for each in files if "." not in each.stem]
         parts = {each.as_posix(): ".".join(each.with_suffix("").parts) for each in paths}
@@ -236,18 +387,29 @@ def reached(repo: HostRepo, modules: Iterable[str], without: str = "") -> dict[s
     return seen
 
 
-def defaults(repo: HostRepo, module: str, name: str) -> Iterator[ast.expr]:
+def defaults(repo: HostRepo, module: str, name: str) -> list[ast.expr]:
     """What the classes of a module first assign to ``self.name``, and defaults of that option."""
-    for node in nodes(repo.tree(module)):
+    return _defaults(repo.tree(module)).get(name, [])
+
+
+@lru_cache(maxsize=256)
+def _defaults(tree: ast.Module | None) -> dict[str, list[ast.expr]]:
+    """``defaults`` of all names."""
+    found: dict[str, list[ast.expr]] = {}
+    for node in nodes(tree):
         if isinstance(node, ast.FunctionDef) and node.name == "__init__":
-            for each in ast.walk(node):
-                if isinstance(each, ast.Assign) and ast.unparse(each.targets[0]) == f"self.{name}":
-                    yield each.value
+            for made in (each for each in nodes(node) if isinstance(each, ast.Assign)):
+                owner, _, name = ast.unparse(made.targets[0]).partition(".")
+                if owner == "self":
+                    found.setdefault(name, []).append(made.value)
         elif isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "add_argument":
             given = {each.arg: each.value for each in node.keywords}
-            switch = getattr(given.get("action"), "value", "") == "store_true"
-            if any(getattr(each, "value", None) == f"--{name}" for each in node.args):
-                yield given.get("default", ast.Constant(False if switch else None))
+            action = getattr(given.get("action"), "value", "")
+            switch = {"store_true": False, "store_false": True}.get(str(action))
+            for each in filter(None, (getattr(name, "value", "") for name in node.args)):
+                value = given.get("default", ast.Constant(switch))
+                found.setdefault(str(each).removeprefix("--"), []).append(value)
+    return found
 
 
 def read_flags(repo: HostRepo, line: CommandLine) -> list[Finding]:
@@ -258,10 +420,14 @@ def read_flags(repo: HostRepo, line: CommandLine) -> list[Finding]:
         tree = repo.tree(module_of(script))
         if tree is None:
             continue
+        called = (
+            getattr(node.func, "id", "") for node in nodes(tree) if isinstance(node, ast.Call)
+        )
+        parts = (tree, *(repo.function("arguments", each) for each in called if each))
         if not any(
-            isinstance(node, ast.Call)
-            and getattr(node.func, "attr", "") in ("parse_args", "parse_known_args")
-            for node in nodes(tree)
+            getattr(node, "attr", "") in ("parse_args", "parse_known_args")
+            for each in parts
+            for node in nodes(each)
         ):
             others = [name for name in imported(tree) if name in _OTHER_FLAGS]
             by = f"it reads its settings with {', '.join(others)}" if others else "no argparse"

@@ -240,6 +240,16 @@ def test_a_script_without_our_flags_is_refused(tmp_path, text, says):
     assert any("[flags]" in error and says in error for error in errors(repo))
 
 
+def test_a_function_beside_the_argument_groups_may_read_the_flags(tmp_path):
+    repo = skeleton(tmp_path)
+    repo = rewritten(repo, "train.py", "parser.parse_args(", "merged_args(parser, ")
+    assert any("no argparse" in error for error in errors(repo))
+    groups = tmp_path / "arguments/__init__.py"
+    reads = "def merged_args(parser, line):\n    return parser.parse_args(line)\n"
+    groups.write_text(groups.read_text() + reads)
+    assert not errors(HostRepo(tmp_path))
+
+
 def test_argument_groups_make_flags_of_their_attributes(tmp_path):
     repo = skeleton(tmp_path)
     repo = rewritten(repo, "train.py", '"--model_path", ', "")
