@@ -259,6 +259,8 @@ def _check_script(fork: Fork, script: str) -> None:
         fork.refuse("script", script, f"copies its model, {copied[0]}", "the one that it makes")
     if several := _trainings(fork.repo, reading.module_of(script)):
         fork.refuse("script", script, *several)
+    if until := _rests(tree):
+        fork.refuse("script", script, f"its optimizer steps only where {until}", "to its end")
     compared = [node for node in nodes(tree) if isinstance(node, ast.Compare)]
     tests = [ast.unparse(each) for each in compared if isinstance(each.ops[0], ast.In)]
     if not any(re.search(r" in (\w+\.)*sav\w*$", each) for each in tests):
@@ -273,6 +275,28 @@ def _check_script(fork: Fork, script: str) -> None:
     if any(each in nodes(outer)[1:] for each in counted for outer in loops):
         fork.refuse("script", script, "a training in a loop", "one training")
     fork.one_run = fork.one_run or _not_resumed(fork.repo, script, tree)
+
+
+def _rests(tree: ast.Module) -> str:
+    """Where alone a script steps its model's optimizer, with which thresholds step; "" if to its
+    end.
+    """
+    asked = (each for each in nodes(tree) if isinstance(each, ast.If))
+    tests = {each: ast.unparse(each.test) for each in asked}
+    parts = {
+        inner: test
+        for each, test in tests.items()
+        if re.search(r"\biteration\b(?!.*\biterations\b)", test)
+        for part in (*each.body, *each.orelse)
+        for inner in nodes(part)
+    }
+    models = reading.owners(tree)
+    steps = [
+        node
+        for node, name in _method_calls(tree)
+        if name == "step" and ast.unparse(node.func).removesuffix(".optimizer.step") in models
+    ]
+    return parts[steps[0]] if steps and all(each in parts for each in steps) else ""
 
 
 def _is_loop(node: ast.AST) -> bool:
@@ -679,6 +703,9 @@ def _check_call(fork: Fork, at: str, function: str, call: graphdeco.CallInSource
     """Settings and arguments besides the known ones: off, or without a part in the picture."""
     if blended := blended_argument(fork.repo, call):
         fork.blended[call.package] = blended
+    if call.other_matrix:
+        found = f"projmatrix is {call.other_matrix}"
+        fork.refuse("rasterizer-call", at, found, "the cameras of 3DGS")
     if POSES & call.arguments:
         fork.warn("rasterizer-call", at, "the cameras, which stand still in stage 2")
     screens = frozenset(filter(_SCREEN.fullmatch, call.arguments))

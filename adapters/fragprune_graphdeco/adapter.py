@@ -338,7 +338,7 @@ class GraphdecoAdapter(ScriptAdapter):
             for each in calls:
                 own = each.package == self.package
                 call = replace(each, package="") if own else each
-                if not any(known.answers(call) for known in accepted):
+                if call.other_matrix or not any(known.answers(call) for known in accepted):
                     found.append((name, repo.at(renderer, each.line), str(call), expected))
             if not calls:
                 nothing = "no settings passed by keyword, or they are made elsewhere"
@@ -506,7 +506,10 @@ class GraphdecoAdapter(ScriptAdapter):
     def not_drawn(self, repo: HostRepo, arguments: list[str]) -> list[str]:
         """What of a command our readers would draw otherwise."""
         flags = (flag for flag in self.undrawn_flags if flag in arguments)
-        return [f"{flag}, which our readers do not support" for flag in flags]
+        projection = repo.function("utils.graphics_utils", "getProjectionMatrix")
+        pinhole = projection is None or "[3, 2]" in ast.unparse(projection)
+        other = [] if pinhole else ["its getProjectionMatrix, which is no pinhole camera's"]
+        return [f"{flag}, which our readers do not support" for flag in flags] + other
 
     def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any]:
         """No fields: vanilla's rules apply."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
@@ -72,6 +73,17 @@ class CallInSource(RasterizerCall):
     line: int = 0
     names: tuple[str, ...] = ()
     given: Mapping[str, ast.expr] = field(default_factory=dict, compare=False)
+
+    @property
+    def other_matrix(self) -> str:
+        """What it passes as the projection, if that is called by another name; "" if not."""
+        matrix = self.given.get("projmatrix")
+        text = ast.unparse(matrix) if isinstance(matrix, ast.Attribute) else ""
+        return "" if re.search("proj|full|mvp", text) else text
+
+    def __str__(self) -> str:
+        projects = f", projmatrix is {self.other_matrix}" if self.other_matrix else ""
+        return f"{super().__str__()}{projects}"
 
 
 def drawing_functions(repo: HostRepo, module: str) -> list[str]:

@@ -257,6 +257,8 @@ class _Project:
                     self._found(re.compile(rf"\b{re.escape(text)}\s*=?\s*([\d.]+)f?\b"))
                 )
                 width = float(constant[0][2]) if constant else _LOW_PASS
+                if not constant and self._assigned(path, len(self.texts[path]), text):
+                    yield self._finding(path, position, f"Gaussians widened by {text}", "by 0.3")
             if width != _LOW_PASS:
                 yield self._finding(
                     path, position, f"a low-pass filter of {width:g}", f"one of {_LOW_PASS}"

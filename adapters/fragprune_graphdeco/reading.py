@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import builtins
 import contextlib
 import operator
 import re
@@ -156,7 +157,13 @@ def _misfits(repo: HostRepo, module: str) -> tuple[str, ...]:
     models, model = owners(tree), _definition(repo, "scene.gaussian_model", "GaussianModel")
     reached = by_default(repo, ("arguments", module), tree) if tree else ()
     texts = ast.unparse(tree or ast.Pass()) + ast.unparse(model or ast.Pass())
-    for node in (n for n in reached if isinstance(n, ast.Call) and id(n) not in tried):
+    known, open_ended = {*_bindings(tree), *vars(builtins)}, "import *" in texts
+    for node in (each for each in reached if id(each) not in tried):
+        alone = getattr(node.value, "id", None) if isinstance(node, ast.Expr) else None
+        if alone is not None and alone not in known and not open_ended:
+            misfits += (f"names {alone}, which nothing defines",)
+        if not isinstance(node, ast.Call):
+            continue
         owner, _, name = ast.unparse(node.func).rpartition(".")
         found, at = None, repo.at(module, node.lineno)
         if name in ("capture", "restore"):

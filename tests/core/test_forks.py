@@ -731,6 +731,22 @@ REFUSED = {
         [("GaussianModel(3)", "GaussianModel(3, 4)")],
         "its call of GaussianModel gives 2 values of 1, which fails",
     ),
+    "a name that nothing defines": (
+        {},
+        [("        loss.backward()\n", "        loss.backward()\n        s\n")],
+        "names s, which nothing defines",
+    ),
+    "an optimizer that rests": (
+        {},
+        [
+            (
+                "        gaussians.optimizer.step()",
+                "        if iteration < opt.warm_up:\n            gaussians.optimizer.step()",
+            )
+        ],
+        "its optimizer steps only where iteration < opt.warm_up",
+    ),
+    "another matrix": ({}, [("projmatrix=0", "projmatrix=view.intrinsics")], "is view.intrinsics"),
     "a method that the model lacks": (
         {},
         [(STATEMENT, "gaussians.prune(mask)")],
@@ -788,6 +804,10 @@ CALLED = {
     "where a checkpoint is given": (
         "    if checkpoint:\n",
         "    if checkpoint:\n        gaussians.prune(mask)\n",
+    ),
+    "an optimizer that rests at the end": (
+        "        gaussians.optimizer.step()",
+        "        if iteration < opt.iterations:\n            gaussians.optimizer.step()",
     ),
     "by an option that is off": (
         STATEMENT,

@@ -84,6 +84,10 @@ def test_gaussians_in_another_order_are_another_picture(tmp_path):
         ),
         ({"widened": "cov[0][0] += 0.1f;"}, "a low-pass filter of 0.1"),
         ({"widened": ""}, "no low-pass filter"),
+        (
+            {"widened": f"{WIDENED} float blur = r * r; return {{ cov[0][0] + blur }};"},
+            "Gaussians widened by blur",
+        ),
         ({"blend": f"{QUADRATIC} float alpha = c.w * exp(power);"}, "not capped at 0.99"),
         (
             {"blend": "float own = min(0.99f, x); float alpha; alpha = a * own + b; alpha = own;"},
