@@ -309,12 +309,15 @@ class GraphdecoAdapter(ScriptAdapter):
         """An error for each input of the rasterizer that is made of other values."""
         module, accepted = self._accepted()
         values = ", ".join(("the values of 3DGS", *self.drawn_from))
-        return [
-            Finding.error("drawn-values", f"{module}:{name}", reason, f"a drawing of {values}")
-            for name in dict.fromkeys(each.function for each in accepted)
-            if (body := repo.function(module, name))
-            for reason, _ in plain.Drawing(repo, module, body, self.drawn_from).inputs()
-        ]
+        found = []
+        for name in dict.fromkeys(each.function for each in accepted):
+            body = repo.function(module, name)
+            drawn = plain.Drawing(repo, module, body, self.drawn_from).inputs() if body else ()
+            found += [(name, reason, f"a drawing of {values}") for reason, _ in drawn]
+            returned = (each.value for each in nodes(body) if isinstance(each, ast.Return))
+            if body and any(isinstance(n, ast.Dict) and not plain.pictures(n) for n in returned):
+                found.append((name, "it returns no render", "the picture under this name"))
+        return [Finding.error("drawn-values", f"{module}:{name}", *each) for name, *each in found]
 
     def _groups(self, repo: HostRepo) -> list[Finding]:
         """An error if the source spells out other param groups."""

@@ -394,7 +394,7 @@ def _drawing(repo: HostRepo, module: str) -> list[ast.FunctionDef]:
     """The functions of a module that draw, ``render`` first, then those that return a picture."""
     body = getattr(repo.tree(module), "body", ())
     found = [each for each in body if isinstance(each, ast.FunctionDef) and _call(each)]
-    return sorted(found, key=lambda each: (each.name != "render", not _pictures(each)))
+    return sorted(found, key=lambda each: (each.name != "render", not pictures(each)))
 
 
 def _call(function: ast.AST, off: Collection[str] = ()) -> ast.Call | None:
@@ -426,7 +426,7 @@ def arguments(call: ast.AST | None) -> dict[str, ast.expr]:
     return {_GSPLAT.get(name, name): value for name, value in given.items()}
 
 
-def _pictures(function: ast.AST) -> list[ast.expr]:
+def pictures(function: ast.AST) -> list[ast.expr]:
     """What a function returns as ``render``."""
     dicts = [node for node in nodes(function) if isinstance(node, ast.Dict)]
     pairs = [pair for each in dicts for pair in zip(each.keys, each.values, strict=True)]
@@ -440,7 +440,7 @@ def _shown(function: ast.AST) -> list[ast.AST]:
         for target in node.targets if isinstance(node, ast.Assign) else ():
             first = target.elts[0] if isinstance(target, ast.Tuple) else target
             made.setdefault(getattr(first, "id", ""), []).append(node.value)  # type: ignore[attr-defined]
-    found: list[ast.AST] = [*_pictures(function)]
+    found: list[ast.AST] = [*pictures(function)]
     for each in found:  # it grows
         if isinstance(each, ast.Name):
             found += made.pop(each.id, [])
@@ -624,9 +624,9 @@ class Drawing:
         yield from self.inputs()
         calls = read_calls(self.repo, self.module, self.function.name)
         names = dict.fromkeys([*arguments(self.call), *(n for each in calls for n in each.given)])
-        if pictures := [each for each in names if _PICTURES.fullmatch(each)]:
-            yield f"its rasterizer also takes {', '.join(pictures)}", False
-        for made in filter(None, map(self._made_into, _pictures(self.function))):
+        if blended := [each for each in names if _PICTURES.fullmatch(each)]:
+            yield f"its rasterizer also takes {', '.join(blended)}", False
+        for made in filter(None, map(self._made_into, pictures(self.function))):
             at = self.repo.at(self.module, made.lineno)
             yield f"its picture is made into {ast.unparse(made)[:60]} ({at})", True
 
@@ -635,7 +635,7 @@ class Drawing:
         made = [node for node in nodes(self.function) if isinstance(node, ast.Assign)]
         targets = [each.targets[0] for each in made if each.value is self.call]
         names = [getattr(e, "id", "") for t in targets for e in getattr(t, "elts", ())]
-        shown = {getattr(each, "id", "") for each in _pictures(self.function)} & {*names}
+        shown = {getattr(each, "id", "") for each in pictures(self.function)} & {*names}
         before = names[: min(map(names.index, shown), default=0)]
         if others := [each for each in before if re.search("image|render|rgb|colou?r", each)]:
             yield f"its rasterizer returns another picture first, {others[0]}", False

@@ -244,6 +244,16 @@ def test_a_script_without_our_flags_is_refused(tmp_path, text, says):
     assert any("[flags]" in error and says in error for error in errors(repo))
 
 
+def test_a_drawing_function_of_a_host_returns_its_picture_as_render(tmp_path):
+    repo = skeleton(tmp_path)
+    render = tmp_path / "gaussian_renderer/__init__.py"
+    returns = '\n    return {{"{}": image, "radii": radii}}\n'.format
+    render.write_text(render.read_text().rstrip() + returns("render"))
+    assert not errors(repo)
+    render.write_text(render.read_text().replace('"render"', '"foreground"'))
+    assert "returns no render" in errors(HostRepo(tmp_path))[0]
+
+
 def test_a_function_beside_the_argument_groups_may_read_the_flags(tmp_path):
     repo = skeleton(tmp_path)
     repo = rewritten(repo, "train.py", "parser.parse_args(", "merged_args(parser, ")
