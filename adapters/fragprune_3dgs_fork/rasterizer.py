@@ -11,20 +11,10 @@ from typing import Literal
 
 import fragprune_graphdeco as graphdeco
 from fragprune_graphdeco import kernels
-from fragprune_plugins.adapting import HostRepo, is_off
+from fragprune_plugins.adapting import HostRepo, assigned, every, is_off
 
-Role = Literal[
-    "image",
-    "radii",
-    "depth",
-    "invdepth",
-    "alpha",
-    "objects",
-    "count",
-    "weight",
-    "unproved",
-    "unread",
-]
+Sum = Literal["count", "weight"]
+Role = Sum | Literal["image", "radii", "depth", "invdepth", "alpha", "objects", "unproved", "unread"]
 
 _Z = r"depths\[collected_id\[j\]\]"
 _DECLARED = re.compile(r"(?:float|auto)(\w+)=([^;]+);")
@@ -145,7 +135,7 @@ def _words(name: str) -> set[str]:
     return {word.rstrip("s") for word in name.split("_")}
 
 
-def _sum_for_gaussians(text: str, name: str) -> Literal["count", "weight"] | None:
+def _sum_for_gaussians(text: str, name: str) -> Sum | None:
     """Whether a buffer of this name counts a Gaussian's drawn fragments, or sums their weights."""
     added = [match for match in _ADDED.finditer(text) if match[2] == name]
     if len(added) != 1 or len(re.findall(rf"atomic\w+\(&\(?{name}\[", text)) != 1:
@@ -189,32 +179,21 @@ def _binding(repo: HostRepo, package: str) -> Iterator[ast.AST]:
 
 
 def _reads(function: ast.FunctionDef, setting: str) -> bool:
-    return any(getattr(node, "attr", "") == setting for node in ast.walk(function))
+    return any(node.attr == setting for node in every(function, ast.Attribute))
 
 
 def _changed(forward: ast.FunctionDef, backward: ast.FunctionDef) -> frozenset[str] | None:
     """Parameters of ``forward`` whose gradients are not what the kernels gave."""
-    given: set[str] = set()
-    for node in ast.walk(backward):
-        if isinstance(node, ast.Assign) and "_backward(" in ast.unparse(node.value):
-            target = node.targets[0]
-            given |= {getattr(each, "id", "") for each in getattr(target, "elts", [target])}
-    for node in ast.walk(backward):
-        if isinstance(node, ast.Assign | ast.AugAssign) and "_backward(" not in ast.unparse(node):
-            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            given -= {ast.unparse(each).split("[")[0] for each in targets}
+    made = {to: value for to, value in assigned(backward) if "_backward(" in ast.unparse(value)}
+    given = {getattr(each, "id", "") for to in made for each in getattr(to, "elts", [to])}
+    changed = [to for to, _ in assigned(backward) if to not in made]
+    changed += [each.target for each in every(backward, ast.AugAssign)]
+    given -= {ast.unparse(each).split("[")[0] for each in changed}
     last = backward.body[-1]
     returned = last.value if isinstance(last, ast.Return) else None
     if isinstance(returned, ast.Name):
-        name = returned.id
-        returned = next(
-            (
-                node.value
-                for node in ast.walk(backward)
-                if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == name
-            ),
-            None,
-        )
+        values = (value for to, value in assigned(backward) if ast.unparse(to) == returned.id)
+        returned = next(values, None)
     if not isinstance(returned, ast.Tuple):
         return None
     names = [each.arg for each in forward.args.args[1:]]

@@ -28,12 +28,7 @@ from fragprune_graphdeco.adapter import (
     optimizers,
     rasterizer_seam,
 )
-from fragprune_graphdeco.call import (
-    CallInSource,
-    RasterizerCall,
-    drawing_functions,
-    read_calls,
-)
+from fragprune_graphdeco.call import CallInSource, RasterizerCall, drawing_functions, read_calls
 from fragprune_graphdeco.densifying import clones, needy, reaches, splits
 from fragprune_graphdeco.kernels import SURFEL
 from fragprune_graphdeco.plain import read_models

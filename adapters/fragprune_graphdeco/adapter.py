@@ -17,6 +17,7 @@ from fragprune_graphdeco.densifying import clones, splits
 from fragprune_graphdeco.kernels import SPLAT, Kernel, read_kernels, vendored
 from fragprune_graphdeco.reading import (
     defaults,
+    entries,
     failing,
     made_models,
     module_of,
@@ -45,7 +46,7 @@ from fragprune_plugins.adapting import (
     SeamCall,
     Splats,
     View,
-    nodes,
+    every,
     replacing,
 )
 
@@ -314,7 +315,7 @@ class GraphdecoAdapter(ScriptAdapter):
             body = repo.function(module, name)
             drawn = plain.Drawing(repo, module, body, self.drawn_from).inputs() if body else ()
             found += [(name, reason, f"a drawing of {values}") for reason, _ in drawn]
-            returned = (each.value for each in nodes(body) if isinstance(each, ast.Return))
+            returned = (each.value for each in every(body, ast.Return))
             if body and any(isinstance(n, ast.Dict) and not plain.pictures(n) for n in returned):
                 found.append((name, "it returns no render", "the picture under this name"))
         return [Finding.error("drawn-values", f"{module}:{name}", *each) for name, *each in found]
@@ -553,14 +554,9 @@ class GraphdecoAdapter(ScriptAdapter):
 
 def group_names(function: Function | None) -> tuple[str, ...]:
     """Names of the param groups that a function spells out as dicts, in source order."""
-    dicts = [node for node in nodes(function) if isinstance(node, ast.Dict)]
-    names = [
-        (value.lineno, value.col_offset, str(value.value))
-        for each in dicts
-        for key, value in zip(each.keys, each.values, strict=True)
-        if isinstance(key, ast.Constant) and key.value == "name" and isinstance(value, ast.Constant)
-    ]
-    return tuple(name for _, _, name in sorted(names))
+    named = (each for each in entries(function, "name") if isinstance(each, ast.Constant))
+    ordered = sorted(named, key=lambda each: (each.lineno, each.col_offset))
+    return tuple(str(each.value) for each in ordered)
 
 
 def resolution(repo: HostRepo, asked: int | None) -> Resolution:
@@ -572,19 +568,18 @@ def resolution(repo: HostRepo, asked: int | None) -> Resolution:
     Raises:
         NotComparedError: the host chooses sizes in another way.
     """
-    everything = nodes(repo.tree(CAMERAS))
+    tree = repo.tree(CAMERAS)
     divisors = {
         element.value
-        for node in everything
-        if isinstance(node, ast.Compare)
-        and isinstance(node.ops[0], ast.In)
+        for node in every(tree, ast.Compare)
+        if isinstance(node.ops[0], ast.In)
         and isinstance(node.left, ast.Attribute)
         and node.left.attr == "resolution"
         and isinstance(node.comparators[0], ast.List | ast.Tuple)
         for element in node.comparators[0].elts
         if isinstance(element, ast.Constant) and isinstance(element.value, int)
     }
-    capped = any(isinstance(node, ast.Constant) and node.value == WIDEST for node in everything)
+    capped = any(node.value == WIDEST for node in every(tree, ast.Constant))
     value = int(default(repo, "_resolution", -1)) if asked is None else asked
     if not divisors or not capped or (value < 1 and value != -1):
         raise NotComparedError(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import builtins
 import contextlib
 import operator
 import re
@@ -17,6 +16,8 @@ from fragprune_plugins.adapting import (
     Finding,
     Function,
     HostRepo,
+    assigned,
+    every,
     imported,
     is_off,
     nodes,
@@ -48,7 +49,7 @@ def read_getters(repo: HostRepo, module: str, unset: Collection[str] = ()) -> li
         name = f"GaussianModel.get_{kind}"
         function, read = repo.function(module, name), kind in ("xyz", "opacity")
         if kind in computed:
-            made = [each.value for each in nodes(function) if isinstance(each, ast.Return)]
+            made = (each.value for each in every(function, ast.Return))
             ends = " or ".join(ast.unparse(each) for each in made if each)
             what = f"get_{kind} is computed, it returns {ends[:60] or 'nothing'}"
         elif read and not (function and is_property(function)):
@@ -71,16 +72,12 @@ def computed_getters(
     getters = {
         each: repo.function(module, f"{model}.get_{each}") for each in (*GETTERS, "features")
     }
-    features = [
-        node
-        for node in nodes(getters.pop("features"))
-        if isinstance(node, ast.BinOp)
-        or (isinstance(node, ast.Call) and ast.unparse(node.func) not in _JOINS)
-    ]
+    own = getters.pop("features")
+    other = any(ast.unparse(each.func) not in _JOINS for each in every(own, ast.Call))
     wanted = {kind: {"stored" if kind == "xyz" else "activated"} for kind in GETTERS}
     return [
         *(k for k, each in getters.items() if each and returns(each, f"_{k}", unset) != wanted[k]),
-        *(["features"] if features else []),
+        *(["features"] if other or every(own, ast.BinOp) else []),
     ]
 
 
@@ -93,10 +90,16 @@ def unset(repo: HostRepo, module: str, model: str) -> set[str]:
     return {each for each, values in nothing.items() if values == {None}}
 
 
+def entries(tree: ast.AST | None, name: str) -> list[ast.expr]:
+    """What dicts have under a name."""
+    dicts = every(tree, ast.Dict)
+    pairs = (pair for each in dicts for pair in zip(each.keys, each.values, strict=True))
+    return [value for key, value in pairs if getattr(key, "value", "") == name]
+
+
 def made_models(repo: HostRepo, module: str) -> list[str]:
     """Classes of models that a script makes, by their names, once for each place."""
-    made = [node.func for node in nodes(repo.tree(module)) if isinstance(node, ast.Call)]
-    names = [getattr(each, "id", "") for each in made]
+    names = [getattr(each.func, "id", "") for each in every(repo.tree(module), ast.Call)]
     return [name for name in names if name.endswith("Model") or name.startswith("GaussianModel")]
 
 
@@ -121,9 +124,8 @@ def failing(repo: HostRepo, scripts: Collection[str]) -> list[str]:
         found += [f"{script} trains by jittor"] * ("jittor" in imported(tree))
         found += [
             f"{script} compiles {node.name}, which trains"
-            for node in nodes(tree)
-            if isinstance(node, ast.FunctionDef)
-            and any("torch.compile" in ast.unparse(each) for each in node.decorator_list)
+            for node in every(tree, ast.FunctionDef)
+            if any("torch.compile" in ast.unparse(each) for each in node.decorator_list)
             and any(getattr(each, "attr", "") == "backward" for each in nodes(node))
         ]
         found += _misfits(repo, module_of(script))[:1]
@@ -132,12 +134,8 @@ def failing(repo: HostRepo, scripts: Collection[str]) -> list[str]:
 
 def owners(tree: ast.AST | None) -> set[str]:
     """Variables, and lists and dicts, that hold models which a script makes."""
-    return {
-        ast.unparse(each).split("[")[0]
-        for node in nodes(tree)
-        if isinstance(node, ast.Assign) and "GaussianModel(" in ast.unparse(node.value)
-        for each in node.targets
-    }
+    pairs = assigned(tree)
+    return {ast.unparse(a).split("[")[0] for a, b in pairs if "GaussianModel(" in ast.unparse(b)}
 
 
 @lru_cache(maxsize=64)  # of the adapters, many ask
@@ -147,23 +145,13 @@ def _misfits(repo: HostRepo, module: str) -> tuple[str, ...]:
     given or asked for.
     """
     tree, misfits = repo.tree(module), tuple[str, ...]()
-    asked = (
-        node
-        for node in nodes(tree)
-        if isinstance(node, ast.Try)
-        or (isinstance(node, ast.If) and isinstance(node.test, ast.Name))
-    )
-    tried = {id(inner) for each in asked for part in each.body for inner in nodes(part)}
+    parts = [node.body for node in every(tree, ast.If) if isinstance(node.test, ast.Name)]
+    parts += [node.body for node in every(tree, ast.Try)]
+    tried = {inner for part in parts for each in part for inner in nodes(each)}
     models, model = owners(tree), _definition(repo, "scene.gaussian_model", "GaussianModel")
     reached = by_default(repo, ("arguments", module), tree) if tree else ()
     texts = ast.unparse(tree or ast.Pass()) + ast.unparse(model or ast.Pass())
-    known, open_ended = {*_bindings(tree), *vars(builtins)}, "import *" in texts
-    for node in (each for each in reached if id(each) not in tried):
-        alone = getattr(node.value, "id", None) if isinstance(node, ast.Expr) else None
-        if alone is not None and alone not in known and not open_ended:
-            misfits += (f"names {alone}, which nothing defines",)
-        if not isinstance(node, ast.Call):
-            continue
+    for node in (each for each in reached if isinstance(each, ast.Call) and each not in tried):
         owner, _, name = ast.unparse(node.func).rpartition(".")
         found, at = None, repo.at(module, node.lineno)
         if name in ("capture", "restore"):
@@ -216,9 +204,9 @@ def _misfit(called: ast.AST | None, call: ast.Call, of_model: bool) -> str:
     if not isinstance(function, ast.FunctionDef) or function.decorator_list or loose:
         return ""
     taken, count = function.args, len(call.args)
-    every = [each.arg for each in (*taken.posonlyargs, *taken.args)]
-    needed = every[: len(every) - len(taken.defaults)]
-    names, needed = (each[made or of_model :] for each in (every, needed))
+    names = [each.arg for each in (*taken.posonlyargs, *taken.args)]
+    needed = names[: len(names) - len(taken.defaults)]
+    names, needed = (each[made or of_model :] for each in (names, needed))
     free = [*names[count:], *(each.arg for each in taken.kwonlyargs)]
     if count > len(names) and not taken.vararg:
         return f"gives {count} values of {len(names)}"
@@ -316,8 +304,7 @@ def returns(getter: Function, stored: str, unset: Collection[str] = ()) -> set[s
             return known.get(value.id, "computed")
         return "stored" if value and ast.unparse(value) == f"self.{stored}" else "computed"
 
-    branches = [node for node in nodes(getter) if isinstance(node, ast.If)]
-    gone = (each for node in branches for each in _skipped(node, unset))
+    gone = (each for node in every(getter, ast.If) for each in _skipped(node, unset))
     skipped = {id(inner) for each in gone for inner in nodes(each)}
     for statement in getter.body:
         for node in (each for each in nodes(statement) if id(each) not in skipped):
@@ -325,8 +312,7 @@ def returns(getter: Function, stored: str, unset: Collection[str] = ()) -> set[s
                 name, made = node.targets[0].id, state(node.value)
                 branch = node is not statement and name in known  # one of several
                 known[name] = "computed" if branch and made != known[name] else made
-    body = [node for node in nodes(getter) if id(node) not in skipped]
-    return {state(node.value) for node in body if isinstance(node, ast.Return)}
+    return {state(n.value) for n in every(getter, ast.Return) if id(n) not in skipped}
 
 
 def _skipped(node: ast.If | ast.IfExp, unset: Collection[str]) -> list[ast.AST]:
@@ -341,18 +327,15 @@ def _skipped(node: ast.If | ast.IfExp, unset: Collection[str]) -> list[ast.AST]:
 def options(repo: HostRepo, module: str, model: str, scripts: Iterable[str]) -> set[str]:
     """What getters ask for that an option of its name, off by default, alone switches on."""
     getters = (repo.function(module, f"{model}.get_{kind}") for kind in GETTERS)
-    tests = [n.test for each in getters for n in nodes(each) if isinstance(n, ast.If | ast.IfExp)]
+    tests = [n.test for each in getters for n in every(each, ast.If, ast.IfExp)]  # type: ignore[attr-defined]
     asked = {n.removeprefix("not ").removeprefix("self.") for n in map(ast.unparse, tests)}
-    assigned = [
-        (ast.unparse(node.targets[0]).split(".")[-1], node.value)
-        for each in (module, *scripts)
-        for node in nodes(repo.tree(each))
-        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Attribute)
-    ]
+    pairs = (pair for each in (module, *scripts) for pair in assigned(repo.tree(each)))
     made = {
-        name
-        for name, value in assigned
-        if not is_off(value) and ast.unparse(value).split(".")[-1] != name
+        target.attr
+        for target, value in pairs
+        if isinstance(target, ast.Attribute)
+        and not is_off(value)
+        and ast.unparse(value).split(".")[-1] != target.attr
     }
     names = {each: each.split(".")[-1] for each in asked}
     values = {k: [*defaults(repo, "arguments", each)] for k, each in names.items()}
@@ -427,15 +410,10 @@ def read_flags(repo: HostRepo, line: CommandLine) -> list[Finding]:
         tree = repo.tree(module_of(script))
         if tree is None:
             continue
-        called = (
-            getattr(node.func, "id", "") for node in nodes(tree) if isinstance(node, ast.Call)
-        )
+        called = (getattr(node.func, "id", "") for node in every(tree, ast.Call))
         parts = (tree, *(repo.function("arguments", each) for each in called if each))
-        if not any(
-            getattr(node, "attr", "") in ("parse_args", "parse_known_args")
-            for each in parts
-            for node in nodes(each)
-        ):
+        read = {node.attr for each in parts for node in every(each, ast.Attribute)}
+        if read.isdisjoint(("parse_args", "parse_known_args")):
             others = [name for name in imported(tree) if name in _OTHER_FLAGS]
             by = f"it reads its settings with {', '.join(others)}" if others else "no argparse"
             found.append((script, by, "flags, read with argparse"))
@@ -453,10 +431,9 @@ def read_flags(repo: HostRepo, line: CommandLine) -> list[Finding]:
 
 def _strings(tree: ast.Module) -> Iterator[str]:
     """Strings in a script that could be flags."""
-    for node in nodes(tree):
-        value = getattr(node, "value", None) if isinstance(node, ast.Constant) else None
-        if isinstance(value, str) and value.startswith("-"):
-            yield value
+    for node in every(tree, ast.Constant):
+        if isinstance(node.value, str) and node.value.startswith("-"):
+            yield node.value
 
 
 def _of_groups(repo: HostRepo) -> Iterator[str]:
@@ -467,10 +444,8 @@ def _of_groups(repo: HostRepo) -> Iterator[str]:
     for path in sorted((repo.root / "arguments").glob("*.py")):
         tree = repo.tree(f"arguments.{path.stem}") if path.stem != "__init__" else None
         yield from _strings(tree) if tree else ()
-    for node in nodes(repo.tree("arguments")):
-        targets = node.targets if isinstance(node, ast.Assign) else []
-        for each in targets:
-            if isinstance(each, ast.Attribute) and ast.unparse(each.value) == "self":
-                yield f"--{each.attr.removeprefix('_')}"
-                if each.attr.startswith("_"):
-                    yield f"-{each.attr[1]}"
+    for each, _ in assigned(repo.tree("arguments")):
+        if isinstance(each, ast.Attribute) and ast.unparse(each.value) == "self":
+            yield f"--{each.attr.removeprefix('_')}"
+            if each.attr.startswith("_"):
+                yield f"-{each.attr[1]}"

@@ -731,11 +731,6 @@ REFUSED = {
         [("GaussianModel(3)", "GaussianModel(3, 4)")],
         "its call of GaussianModel gives 2 values of 1, which fails",
     ),
-    "a name that nothing defines": (
-        {},
-        [("        loss.backward()\n", "        loss.backward()\n        s\n")],
-        "names s, which nothing defines",
-    ),
     "an optimizer that rests": (
         {},
         [
