@@ -11,17 +11,8 @@ from weakref import WeakKeyDictionary
 
 import fragprune_graphdeco as graphdeco
 from fragprune_3dgs_fork.rasterizer import Output, blended_argument, changed_gradients, meaning
-from fragprune_graphdeco import kernels, plain, reading
-from fragprune_plugins.adapting import (
-    Finding,
-    Function,
-    HostRepo,
-    assigned,
-    every,
-    is_off,
-    nodes,
-    off_by_default,
-)
+from fragprune_graphdeco import assigned, every, kernels, plain, reading
+from fragprune_plugins.adapting import Finding, Function, HostRepo, is_off, nodes, off_by_default
 
 MODEL, CLASS, RENDERER = "scene.gaussian_model", "GaussianModel", "gaussian_renderer"
 PARAMETERS = {"_xyz", "_features_dc", "_features_rest", "_opacity", "_scaling", "_rotation"}

@@ -10,11 +10,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import fragprune_graphdeco as graphdeco
-from fragprune_graphdeco import kernels
-from fragprune_plugins.adapting import HostRepo, assigned, every, is_off
+from fragprune_graphdeco import assigned, every, kernels
+from fragprune_plugins.adapting import HostRepo, is_off
 
 Sum = Literal["count", "weight"]
-Role = Sum | Literal["image", "radii", "depth", "invdepth", "alpha", "objects", "unproved", "unread"]
+Role = (
+    Sum | Literal["image", "radii", "depth", "invdepth", "alpha", "objects", "unproved", "unread"]
+)
 
 _Z = r"depths\[collected_id\[j\]\]"
 _DECLARED = re.compile(r"(?:float|auto)(\w+)=([^;]+);")

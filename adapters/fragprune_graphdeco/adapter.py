@@ -18,6 +18,7 @@ from fragprune_graphdeco.kernels import SPLAT, Kernel, read_kernels, vendored
 from fragprune_graphdeco.reading import (
     defaults,
     entries,
+    every,
     failing,
     made_models,
     module_of,
@@ -46,7 +47,6 @@ from fragprune_plugins.adapting import (
     SeamCall,
     Splats,
     View,
-    every,
     replacing,
 )
 
@@ -279,10 +279,9 @@ class GraphdecoAdapter(ScriptAdapter):
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
         """Check scripts and flags, the host's own names, the model, and the rasterizer."""
-        missing = [
-            f"no {name}" for name in self.scripts_of(repo) if not (repo.root / name).is_file()
-        ]
+        missing = []
         for script in self.scripts_of(repo):
+            missing += [] if (repo.root / script).is_file() else [f"no {script}"]
             made = made_models(repo, module_of(script))
             if made and "GaussianModel" not in made:
                 missing.append(f"{script} makes {', '.join(dict.fromkeys(made))}")
@@ -290,15 +289,10 @@ class GraphdecoAdapter(ScriptAdapter):
             module = module or MODEL
             missing += [] if repo.mentions([module], [name]) else [f"no {name} in {module}"]
         missing += failing(repo, self.scripts_of(repo))
-        packages = dict.fromkeys([self.package, *(each.package for each in self.calls)])
+        packages = dict.fromkeys([self.package, *(c.package for c in self.calls if c.package)])
         return [
             *self.other_host(repo, missing),
-            *(
-                finding
-                for package in packages
-                if package
-                for finding in read_kernels(repo, package, self.kernel)
-            ),
+            *(each for name in packages for each in read_kernels(repo, name, self.kernel)),
             *read_getters(repo, MODEL),
             *(read_flags(repo, self.command_line(repo)) if repo.tree(MODEL) else ()),
             *self._groups(repo),
@@ -457,31 +451,17 @@ class GraphdecoAdapter(ScriptAdapter):
         from fragprune_plugins.adapting import thresholds_of
 
         m = self.read_model(ply)
-        rows = len(m.xyz)
-        tensors = dict(
-            zip(
-                [group.name for group in GROUPS],
-                (m.xyz, m.f_dc, m.f_rest, m.opacity, m.scaling, m.rotation),
-                strict=True,
-            )
-        )
-        parameters = {name: torch.nn.Parameter(tensor) for name, tensor in tensors.items()}
-        optimizer = getattr(torch.optim, self.optimizer)(
-            [{"params": [p], "lr": 0.0, "name": name} for name, p in parameters.items()],
-            lr=0.0,
-            eps=1e-15,
-        )
+        rows, names = len(m.xyz), [group.name for group in GROUPS]
+        values = (m.xyz, m.f_dc, m.f_rest, m.opacity, m.scaling, m.rotation)
+        parameters = {k: torch.nn.Parameter(v) for k, v in zip(names, values, strict=True)}
+        groups = [{"params": [p], "lr": 0.0, "name": name} for name, p in parameters.items()]
+        optimizer = getattr(torch.optim, self.optimizer)(groups, lr=0.0, eps=1e-15)
         state: dict[str, Any] = optimizer.state_dict()
         if (store := thresholds_of(ply, rows)) is not None:
             state[CHECKPOINT_KEY] = store.state_dict()
         return (
             m.sh_degree,
-            parameters["xyz"],
-            parameters["f_dc"],
-            parameters["f_rest"],
-            parameters["scaling"],
-            parameters["rotation"],
-            parameters["opacity"],
+            *(parameters[k] for k in ("xyz", "f_dc", "f_rest", "scaling", "rotation", "opacity")),
             torch.zeros(rows),
             torch.zeros(rows, 1),
             torch.zeros(rows, 1),

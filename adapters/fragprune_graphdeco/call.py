@@ -7,7 +7,8 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
-from fragprune_plugins.adapting import Function, HostRepo, assigned, every, nodes
+from fragprune_graphdeco.reading import assigned, every
+from fragprune_plugins.adapting import Function, HostRepo, nodes
 
 SETTINGS, RASTERIZER = "GaussianRasterizationSettings", "GaussianRasterizer"
 

@@ -16,14 +16,19 @@ from weakref import WeakKeyDictionary
 from fragprune_graphdeco import reading
 from fragprune_graphdeco.call import ARGUMENTS, RASTERIZER, read_calls
 from fragprune_graphdeco.kernels import ORDER, SPLAT, read_kernels
-from fragprune_graphdeco.reading import ACTIVATIONS, defaults, made_models, returns
+from fragprune_graphdeco.reading import (
+    ACTIVATIONS,
+    assigned,
+    defaults,
+    every,
+    made_models,
+    returns,
+)
 from fragprune_plugins.adapting import (
     Function,
     HostRepo,
     Plain,
-    assigned,
     change_of,
-    every,
     is_off,
     nodes,
     off_by_default,

@@ -9,15 +9,13 @@ import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from functools import lru_cache
-from typing import Any
+from typing import Any, TypeVar
 
 from fragprune_plugins.adapting import (
     CommandLine,
     Finding,
     Function,
     HostRepo,
-    assigned,
-    every,
     imported,
     is_off,
     nodes,
@@ -88,6 +86,22 @@ def unset(repo: HostRepo, module: str, model: str) -> set[str]:
     asked = {each: list(defaults(repo, module, each)) for each in _ASKED.findall(texts)}
     nothing = {each: {getattr(v, "value", v) for v in values} for each, values in asked.items()}
     return {each for each, values in nothing.items() if values == {None}}
+
+
+Node = TypeVar("Node", bound=ast.AST)
+
+
+def every(tree: ast.AST | None, *kinds: type[Node]) -> list[Node]:
+    """Those of these kinds among ``nodes``."""
+    return [each for each in nodes(tree) if isinstance(each, kinds)]
+
+
+def assigned(tree: ast.AST | None) -> list[tuple[ast.expr, ast.expr]]:
+    """What gets which value in assignments, one by one where tuples do."""
+    pairs = [(each, node.value) for node in every(tree, ast.Assign) for each in node.targets]
+    several = [(a, b) for a, b in pairs if isinstance(a, ast.Tuple) and isinstance(b, ast.Tuple)]
+    singles = (each for a, b in several for each in zip(a.elts, b.elts, strict=False))
+    return [*(each for each in pairs if each not in several), *singles]
 
 
 def entries(tree: ast.AST | None, name: str) -> list[ast.expr]:

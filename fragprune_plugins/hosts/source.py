@@ -11,7 +11,6 @@ from functools import cache, cached_property, lru_cache
 from importlib.metadata import distributions
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TypeVar
 
 from fragprune_plugins.errors import UnknownHostError
 from fragprune_plugins.files.reading import MEBIBYTE, Door, lies_in
@@ -55,22 +54,6 @@ def parsed(text: str) -> ast.Module | None:
 def nodes(tree: ast.AST | None) -> tuple[ast.AST, ...]:
     """Every node of a tree from ``parsed``, or of a part of it, cached; none of None."""
     return tuple(ast.walk(tree)) if tree is not None else ()
-
-
-Node = TypeVar("Node", bound=ast.AST)
-
-
-def every(tree: ast.AST | None, *kinds: type[Node]) -> list[Node]:
-    """Those of these kinds among ``nodes``."""
-    return [each for each in nodes(tree) if isinstance(each, kinds)]
-
-
-def assigned(tree: ast.AST | None) -> list[tuple[ast.expr, ast.expr]]:
-    """What gets which value in assignments, one by one where tuples do."""
-    pairs = [(each, node.value) for node in every(tree, ast.Assign) for each in node.targets]
-    several = [(a, b) for a, b in pairs if isinstance(a, ast.Tuple) and isinstance(b, ast.Tuple)]
-    singles = (each for a, b in several for each in zip(a.elts, b.elts, strict=False))
-    return [*(each for each in pairs if each not in several), *singles]
 
 
 def imported(tree: ast.Module | None) -> list[str]:
@@ -210,7 +193,8 @@ class HostRepo:
 
     def calls(self, module: str, name: str) -> list[ast.Call]:
         """Every call of a bare name in a module, in source order."""
-        return [n for n in every(self.tree(module), ast.Call) if getattr(n.func, "id", "") == name]
+        made = (node for node in nodes(self.tree(module)) if isinstance(node, ast.Call))
+        return [each for each in made if getattr(each.func, "id", "") == name]
 
     def absolute(self, module: str, node: ast.ImportFrom) -> str:
         """The absolute dotted name of a ``from ... import`` in a module."""
