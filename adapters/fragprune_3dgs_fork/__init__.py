@@ -292,7 +292,6 @@ class ForkAdapter(GraphdecoAdapter):
         served = replace(self.command_line(repo), scripts=fork.scripts)
         kernel = partial(kernels.read_kernels, repo, kernel=kernels.SPLAT)
         return [
-            *self.other_host(repo, [*reading.renamed(repo), *reading.compiled(repo, fork.scripts)]),
             *fork.findings,
             *(f for found in map(kernel, fork.outputs) for f in found if f.code == kernels.ORDER),
             *read_getters(fork),

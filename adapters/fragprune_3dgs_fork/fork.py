@@ -10,21 +10,9 @@ from functools import cached_property, lru_cache
 from weakref import WeakKeyDictionary
 
 import fragprune_graphdeco as graphdeco
-from fragprune_3dgs_fork.rasterizer import (
-    Output,
-    blended_argument,
-    changed_gradients,
-    meaning,
-)
-from fragprune_graphdeco import kernels, plain, reading
-from fragprune_plugins.adapting import (
-    Finding,
-    Function,
-    HostRepo,
-    is_off,
-    nodes,
-    off_by_default,
-)
+from fragprune_3dgs_fork.rasterizer import Output, blended_argument, changed_gradients, meaning
+from fragprune_graphdeco import assigned, every, kernels, plain, reading
+from fragprune_plugins.adapting import Finding, Function, HostRepo, is_off, nodes, off_by_default
 
 MODEL, CLASS, RENDERER = "scene.gaussian_model", "GaussianModel", "gaussian_renderer"
 PARAMETERS = {"_xyz", "_features_dc", "_features_rest", "_opacity", "_scaling", "_rotation"}
@@ -130,11 +118,19 @@ class Fork:
         """Whether the model has a method of this name."""
         return method in _methods(self.repo)
 
+    @property
+    def options_in(self) -> tuple[str, ...]:
+        """The modules that give options and attributes of the model their defaults."""
+        return ("arguments", MODEL, *map(reading.module_of, self.scripts))
+
+    def tree(self, script: str) -> ast.Module:
+        """The tree of a script."""
+        return self.repo.tree(reading.module_of(script)) or ast.Module([], [])
+
     def is_off(self, name: str) -> bool:
         """Whether an option or an attribute of the model is None or False by default."""
-        modules = ("arguments", MODEL, *map(reading.module_of, self.scripts))
-        values = [each for m in modules for each in reading.defaults(self.repo, m, name)]
-        return bool(values) and all(map(is_off, values))
+        given = [e for each in self.options_in for e in reading.defaults(self.repo, each, name)]
+        return bool(given) and all(map(is_off, given))
 
     def refuse(self, code: str, where: str, found: str, expected: str) -> None:
         """Add an error."""
@@ -169,16 +165,15 @@ _known: WeakKeyDictionary[HostRepo, Fork] = WeakKeyDictionary()
 def read_fork(repo: HostRepo) -> Fork:
     """Read a checkout, once; of several scripts only those that can be served, if one can."""
     if repo not in _known:
-        fork = _read(repo, reading.training_scripts(repo, "*train*.py", "*/*train*.py"))
+        fork = _read(repo, reading.training_scripts(repo, *reading.SCRIPTS, "*/*train*.py"))
         if fork.errors and len(fork.scripts) > 1:
             alone = {script: _read(repo, (script,)) for script in fork.scripts}
             if served := tuple(script for script, each in alone.items() if not each.errors):
-                others = fork.unserved
-                fork = _read(repo, served)
                 refused = {
                     name: each.errors[0].found for name, each in alone.items() if each.errors
                 }
-                fork.unserved = others | refused
+                unserved, fork = fork.unserved | refused, _read(repo, served)
+                fork.unserved = unserved
         for script, why in fork.unserved.items() if fork.scripts else ():
             fork.warn("script", script, f"{script}, which is not served: {why}")
         _known[repo] = fork
@@ -203,20 +198,13 @@ def _read_scripts(fork: Fork, scripts: tuple[str, ...]) -> None:
     """Of these scripts, the training scripts of the model class: they make it once."""
     repo = fork.repo
     for script in scripts:
-        tree = repo.tree(reading.module_of(script))
-        assert tree is not None  # it is a candidate
-        networks = _networks(repo, script)
-        made = [
-            each
-            for each in reading.made_models(repo, reading.module_of(script))
-            if each not in networks
-        ]
+        module, networks = reading.module_of(script), _networks(repo, script)
+        made = [each for each in reading.made_models(repo, module) if each not in networks]
         if CLASS in made and len(set(made)) == 1:
             fork.scripts += (script,)
-            if lacking := _lacking(repo, script):
-                found = f"its call of {CLASS} lacks {lacking}, which fails"
+            for found in reading.failing(repo, (script,)):
                 fork.refuse("script", script, found, "a script that runs")
-            if len(made) > 1 or _in_loop(tree, CLASS):
+            if len(made) > 1 or _in_loop(fork.tree(script), CLASS):
                 fork.one_run = f"{script} makes several models"
         elif made:
             fork.unserved[script] = f"makes {', '.join(dict.fromkeys(made))}"
@@ -228,21 +216,6 @@ def _read_scripts(fork: Fork, scripts: tuple[str, ...]) -> None:
         fork.refuse("other-host", str(repo.root), found, "a *train*.py that makes GaussianModels")
     for script in fork.scripts:
         _check_script(fork, script)
-
-
-def _lacking(repo: HostRepo, script: str) -> str:
-    """A parameter of the model's class that a script's call does not give; "" for none."""
-    function = repo.function(MODEL, f"{CLASS}.__init__")
-    if function is None:
-        return ""
-    own = [each.arg for each in function.args.args[1:]]
-    needed = own[: len(own) - len(function.args.defaults)]
-    for call in repo.calls(reading.module_of(script), CLASS):
-        given = {each.arg for each in call.keywords}
-        several = None in given or any(isinstance(each, ast.Starred) for each in call.args)
-        if absent := [each for each in needed[len(call.args) :] if each not in given]:
-            return "" if several else absent[0]
-    return ""
 
 
 def _networks(repo: HostRepo, script: str) -> set[str]:
@@ -261,12 +234,11 @@ def _networks(repo: HostRepo, script: str) -> set[str]:
 
 def _check_script(fork: Fork, script: str) -> None:
     """A script trains in this process, and goes backward once in an iteration."""
-    tree = fork.repo.tree(reading.module_of(script))
-    assert tree is not None  # it is a candidate
+    tree = fork.tree(script)
     if _PROCESSES.search(ast.unparse(tree)):
         found = "it trains in processes of its own"
         fork.refuse("script", script, found, "one process that keeps its files")
-    owners = "|".join(map(re.escape, sorted(_owners(tree)))) or "-"
+    owners = "|".join(map(re.escape, sorted(reading.owners(tree)))) or "-"
     if copied := re.search(rf"\bdeepcopy\(({owners})\)", ast.unparse(tree)):
         fork.refuse("script", script, f"copies its model, {copied[0]}", "the one that it makes")
     if size := _size(fork.repo, script):
@@ -275,15 +247,17 @@ def _check_script(fork: Fork, script: str) -> None:
         fork.refuse("script", script, found, expected)
     if several := _trainings(fork.repo, reading.module_of(script)):
         fork.refuse("script", script, *several)
-    compared = [node for node in nodes(tree) if isinstance(node, ast.Compare)]
+    if until := _rests(tree):
+        fork.refuse("script", script, f"its optimizer steps only where {until}", "to its end")
+    compared = every(tree, ast.Compare)
     tests = [ast.unparse(each) for each in compared if isinstance(each.ops[0], ast.In)]
     if not any(re.search(r" in (\w+\.)*sav\w*$", each) for each in tests):
         found = "it does not save where --save_iterations says"
         fork.refuse("script", script, found, "a model at these iterations")
     loops = [
-        node
-        for node in nodes(tree)
-        if isinstance(node, ast.For) and any(name == "backward" for _, name in _method_calls(node))
+        loop
+        for loop in every(tree, ast.For)
+        if any(name == "backward" for _, name in _method_calls(loop))
     ]
     counted = [each for each in loops if "iterations" in ast.unparse(each.iter)]
     if any(each in nodes(outer)[1:] for each in counted for outer in loops):
@@ -294,20 +268,34 @@ def _check_script(fork: Fork, script: str) -> None:
 def _size(repo: HostRepo, script: str) -> str:
     """What a script gives a drawing function for the size of its pictures; "" for nothing."""
     trees = reading.reached(repo, [reading.module_of(script)], RENDERER).values()
-    calls = [each for tree in trees for each in nodes(tree) if isinstance(each, ast.Call)]
+    calls = [each for tree in trees for each in every(tree, ast.Call)]
     for name in graphdeco.drawing_functions(repo, RENDERER):
         parameters = repo.parameters(RENDERER, name) or ()
         given = [call.given for call in graphdeco.read_calls(repo, RENDERER, name)]
         sizes = [each.get(key) for each in given for key in ("image_height", "image_width")]
-        read = {each.id for size in sizes for each in nodes(size) if isinstance(each, ast.Name)}
+        read = {each.id for size in sizes for each in every(size, ast.Name)}
+        cameras = {each for each in parameters if _CAMERA.match(each)} | {*parameters[:1]}
         for call in (each for each in calls if getattr(each.func, "id", "") == name):
             passed = dict(zip(parameters, call.args, strict=False))
             passed |= {each.arg: each.value for each in call.keywords if each.arg}
-            for parameter, value in passed.items():
-                camera = _CAMERA.match(parameter) or parameter == parameters[0]
-                if parameter in read and not camera and not is_off(value):
-                    return f"{parameter}={ast.unparse(value)}"
+            for parameter in (passed.keys() & read) - cameras:
+                if not is_off(passed[parameter]):
+                    return f"{parameter}={ast.unparse(passed[parameter])}"
     return ""
+
+
+def _rests(tree: ast.Module) -> str:
+    """Where alone a script steps its model's optimizer, with which thresholds step; "" if to its
+    end.
+    """
+    models, parts = reading.owners(tree), dict[ast.AST, str]()
+    for node in every(tree, ast.If):
+        test = ast.unparse(node.test)
+        if re.search(r"\biteration\b(?!.*\biterations\b)", test):
+            parts |= {inner: test for part in (*node.body, *node.orelse) for inner in nodes(part)}
+    called = [n for n, name in _method_calls(tree) if name == "step"]
+    steps = [n for n in called if ast.unparse(n.func).removesuffix(".optimizer.step") in models]
+    return parts[steps[0]] if steps and parts.keys() >= {*steps} else ""
 
 
 def _is_loop(node: ast.AST) -> bool:
@@ -345,10 +333,8 @@ def _trainings(repo: HostRepo, module: str) -> tuple[str, str] | None:
     several += [each for each in training if len(repo.calls(module, each)) > 1]
     if several:
         return f"several calls of {several[0]}, which trains", "one training"
-    return (
-        f"{most} places that go backward, perhaps in one iteration",
-        "one, by which steps are counted",
-    )
+    places = f"{most} places that go backward, perhaps in one iteration"
+    return places, "one, by which steps are counted"
 
 
 def _not_resumed(repo: HostRepo, script: str, tree: ast.Module) -> str:
@@ -365,7 +351,7 @@ def _not_resumed(repo: HostRepo, script: str, tree: ast.Module) -> str:
     kept = [each for each in saved if "capture()" in ast.unparse(each)]
     if not any(isinstance(each, ast.Tuple) and len(each.elts) == 2 for each in kept):
         return f"{script} has checkpoints that are not its model and the iteration"
-    made = [node for node in nodes(tree) if isinstance(node, ast.Assign)]
+    made = every(tree, ast.Assign)
     assigned = [(node, ast.unparse(target)) for node in made for target in node.targets]
     read = {
         name: node.lineno
@@ -398,33 +384,30 @@ def _not_resumed(repo: HostRepo, script: str, tree: ast.Module) -> str:
 
 def rests_after_densification(fork: Fork) -> bool:
     """Whether scripts change the model only where they ask for ``densify_until_iter``."""
-    for script in fork.scripts:
-        tree = fork.repo.tree(reading.module_of(script))
-        inside = _while_densifying(tree)
-        for node, name in _method_calls(tree) if tree else ():
-            if name in fork.still and name != "oneupSHdegree" and id(node) not in inside:
-                return False
-    return True
+    return not any(
+        name in fork.still and name != "oneupSHdegree" and node not in _while_densifying(tree)
+        for tree in map(fork.tree, fork.scripts)
+        for node, name in _method_calls(tree)
+    )
 
 
-def _while_densifying(tree: ast.AST | None) -> set[int]:
+@lru_cache(maxsize=64)
+def _while_densifying(tree: ast.AST) -> set[ast.AST]:
     """What a script does only where it asks for ``densify_until_iter``."""
     return {
-        id(inner)
-        for node in nodes(tree)
-        if isinstance(node, ast.If) and "densify_until_iter" in ast.unparse(node.test)
+        inner
+        for node in every(tree, ast.If)
+        if "densify_until_iter" in ast.unparse(node.test)
         for each in node.body
         for inner in nodes(each)
     }
 
 
-def _in_loop(tree: ast.AST, name: str, inside: bool = False) -> bool:
+def _in_loop(tree: ast.AST, name: str) -> bool:
     """Whether a class is called in a loop."""
-    if inside and isinstance(tree, ast.Call) and getattr(tree.func, "id", "") == name:
-        return True
-    loops = (ast.For, ast.While, ast.ListComp, ast.DictComp, ast.GeneratorExp)
-    inside |= isinstance(tree, loops)
-    return any(_in_loop(each, name, inside) for each in ast.iter_child_nodes(tree))
+    loops = every(tree, ast.For, ast.While, ast.ListComp, ast.DictComp, ast.GeneratorExp)
+    called = (each.func for loop in loops for each in every(loop, ast.Call))
+    return any(getattr(each, "id", "") == name for each in called)
 
 
 @lru_cache(maxsize=256)
@@ -439,8 +422,8 @@ def _mentioned(tree: ast.AST) -> frozenset[str]:
 
 
 def _method_calls(tree: ast.AST) -> Iterator[tuple[ast.Call, str]]:
-    for node in nodes(tree):
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+    for node in every(tree, ast.Call):
+        if isinstance(node.func, ast.Attribute):
             yield node, node.func.attr
 
 
@@ -460,44 +443,34 @@ def _read_methods(fork: Fork) -> None:
     changing = {
         name for name, body in methods.items() if name in STATISTICS or any(_assigned(body, "self"))
     } | (PRIMITIVES & methods.keys())
-    while True:
-        more = {
-            name
-            for name, body in methods.items()
-            if name not in changing and any(called in changing for _, called in _method_calls(body))
-        }
-        if not more:
-            break
+    called = {name: {each for _, each in _method_calls(body)} for name, body in methods.items()}
+    while more := {name for name in called.keys() - changing if called[name] & changing}:
         changing |= more
     fork.setups = tuple(
         name
         for name, body in methods.items()
-        if any(_target(node) == "optimizer" for node in nodes(body)) and name != "__init__"
+        if "self.optimizer" in {ast.unparse(to) for to, _ in assigned(body)} and name != "__init__"
     )
-    trained = {
-        name
-        for script in fork.scripts
-        for node in nodes(fork.repo.tree(reading.module_of(script)))
-        if _is_loop(node)
-        for _, name in _method_calls(node)
-    }
+    loops = [each for s in fork.scripts for each in nodes(fork.tree(s)) if _is_loop(each)]
+    trained = {name for each in loops for _, name in _method_calls(each)}
     changing -= {each for each in changing if _MAKES.fullmatch(each)} - (trained - set(fork.setups))
-    called: dict[str, None] = {}
+    still = set[str]()
     for module, tree in fork.trees.items():
-        owners = _owners(tree)
-        statements = {id(each.value) for each in nodes(tree) if isinstance(each, ast.Expr)}
-        early = _while_densifying(tree) if module in map(reading.module_of, fork.scripts) else set()
+        owners = reading.owners(tree)
+        statements = {each.value for each in nodes(tree) if isinstance(each, ast.Expr)}
+        trains = module in map(reading.module_of, fork.scripts)
+        early = _while_densifying(tree) if trains else set[ast.AST]()
         for node, name in _method_calls(tree):
             if name in changing:
-                called[name] = None
+                still |= {name}
                 owner = ast.unparse(node.func.value)  # type: ignore[attr-defined]
                 own = _MODELS.search(owner) or owner.split("[")[0] in owners
-                if own and id(node) in early - statements:
+                if own and node in early - statements:
                     fork.answering |= {name}
-                elif own and id(node) not in statements:
+                elif own and node not in statements:
                     at = fork.repo.at(module, node.lineno)
                     fork.refuse("row-change", at, f"reads what {name} returns", "a statement")
-    fork.still = tuple(name for name in methods if name in called)
+    fork.still = tuple(name for name in methods if name in still)
     keeps = methods.get("_prune_optimizer")
     if keeps is not None and "[mask]" not in ast.unparse(keeps):
         place = fork.repo.place(MODEL, f"{CLASS}._prune_optimizer")
@@ -505,56 +478,27 @@ def _read_methods(fork: Fork) -> None:
         fork.refuse("row-change", place, found, "[mask]")
 
 
-def _owners(tree: ast.AST) -> set[str]:
-    """Variables, and lists and dicts, that hold models which a script makes."""
-    owners: set[str] = set()
-    for node in nodes(tree):  # in order of depth, so not of the source
-        if isinstance(node, ast.Assign) and f"{CLASS}(" in ast.unparse(node.value):
-            owners |= {ast.unparse(each).split("[")[0] for each in node.targets}
-    return owners
-
-
 def plain_distances(repo: HostRepo) -> bool:
     """Whether ``distCUDA2`` gives one tensor, as that of 3DGS does; forks also get neighbours."""
     tree = repo.tree(MODEL)
-    for node in nodes(tree):
-        several = isinstance(node, ast.Subscript) or (
-            isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Tuple)
-        )
-        made = getattr(node, "value", None)
-        if several and getattr(getattr(made, "func", None), "id", "") == "distCUDA2":
-            return False
-    return True
+    taken = [each.value for each in every(tree, ast.Subscript)]
+    taken += [value for target, value in assigned(tree) if isinstance(target, ast.Tuple)]
+    return not any(ast.unparse(each).startswith("distCUDA2(") for each in taken)
 
 
 def _state(capture: Function) -> list[ast.expr]:
     """What a method returns as a tuple, the longest of several."""
-    given = (node.value for node in nodes(capture) if isinstance(node, ast.Return))
+    given = (node.value for node in every(capture, ast.Return))
     listed = (each.elts for each in given if isinstance(each, ast.Tuple | ast.List))
     return max(listed, key=len, default=[])
 
 
 def _taken_back(restore: Function) -> list[int]:
     """Into how many values a method unpacks its first argument."""
-    first = restore.args.args[1].arg if len(restore.args.args) > 1 else ""
-    unpacked = [
-        node.targets[0]
-        for node in nodes(restore)
-        if isinstance(node, ast.Assign) and getattr(node.value, "id", "") == first
-    ]
-    return [
-        len(each.elts)
-        for each in unpacked
-        if isinstance(each, ast.Tuple) and not any(isinstance(e, ast.Starred) for e in each.elts)
-    ]
-
-
-def _target(node: ast.AST) -> str:
-    """The attribute of ``self`` that a statement assigns; "" for others."""
-    for each in node.targets if isinstance(node, ast.Assign) else ():
-        if isinstance(each, ast.Attribute) and ast.unparse(each.value) == "self":
-            return each.attr
-    return ""
+    first = [each.arg for each in restore.args.args[1:2]]
+    unpacked = (to for to, value in assigned(restore) if getattr(value, "id", "") in first)
+    several = (each for each in unpacked if isinstance(each, ast.Tuple))
+    return [len(each.elts) for each in several if not every(each, ast.Starred)]
 
 
 def _assigned(body: ast.AST, owner: str = "") -> Iterator[tuple[int, str]]:
@@ -585,12 +529,16 @@ def _assigned(body: ast.AST, owner: str = "") -> Iterator[tuple[int, str]]:
 def _read_changes(fork: Fork) -> None:
     """A script that changes parameters itself cannot be held still in stage 2."""
     for module, tree in fork.trees.items():
+        early = {getattr(each, "lineno", 0) for each in _while_densifying(tree)}
         for line, name in _assigned(tree):
             at = fork.repo.at(module, line)
-            fork.refuse("row-change", at, f"changes {name} outside the model's methods", "none")
+            if line in early:
+                fork.warn("row-change", at, f"that {at}, which changes {name}, ends before stage 2")
+            else:
+                fork.refuse("row-change", at, f"changes {name} outside the model's methods", "none")
     for script in fork.scripts:
-        trained = fork.repo.tree(reading.module_of(script))
-        owners = _owners(trained) if trained else set()
+        trained, module = fork.tree(script), reading.module_of(script)
+        owners = reading.owners(trained)
         for node in nodes(trained):
             if isinstance(node, ast.Assign) and _OPTIMIZER.match(ast.unparse(node.value)):
                 name = ast.unparse(node.targets[0])
@@ -598,18 +546,15 @@ def _read_changes(fork: Fork) -> None:
                 name = ast.unparse(node.func).removesuffix(".step")
                 owner = name.rpartition(".")[0]
                 if len(node.args) == 1:  # two are those of a sparse Adam
-                    at, found = (
-                        fork.repo.at(reading.module_of(script), node.lineno),
-                        ast.unparse(node)[:60],
-                    )
-                    fork.refuse("optimizer", at, f"another optimizer, {found}", "step()")
+                    found = f"another optimizer, {ast.unparse(node)[:60]}"
+                    fork.refuse("optimizer", fork.repo.at(module, node.lineno), found, "step()")
                 if _MODELS.search(owner) or owner.split("[")[0] in {"", *owners}:
                     continue
             else:
                 continue
-            at = fork.repo.at(reading.module_of(script), node.lineno)
+            at = fork.repo.at(module, node.lineno)
             fork.warn("optimizer", at, f"stage 2 does not freeze what {name} of {script} trains")
-            if f"{name}.load_state_dict(" not in ast.unparse(trained or ast.Pass()):
+            if f"{name}.load_state_dict(" not in ast.unparse(trained):
                 fork.one_run = fork.one_run or f"{script} does not resume what {name} trains"
 
 
@@ -628,12 +573,10 @@ def read_getters(fork: Fork) -> list[Finding]:
         reached |= more
     own = (methods[name] for name in (reached & methods.keys()) - {"__init__"})
     made = {
-        each.attr
+        target.attr
         for tree in (*own, *fork.trees.values(), fork.repo.tree(RENDERER))
-        for node in nodes(tree)
-        if isinstance(node, ast.Assign) and not is_off(node.value)
-        for each in node.targets
-        if isinstance(each, ast.Attribute)
+        for target, value in assigned(tree)
+        if isinstance(target, ast.Attribute) and not is_off(value)
     }
     unset = reading.unset(fork.repo, MODEL, CLASS) - made
     return reading.read_getters(fork.repo, MODEL, unset)
@@ -647,18 +590,14 @@ def _read_draws(fork: Fork) -> None:
     functions = graphdeco.drawing_functions(fork.repo, RENDERER)
     drawing = [each for each in fork.trees.values() if not _mentioned(each).isdisjoint(functions)]
     named = {name for tree in drawing for name in _reached(fork, tree)}
-    while True:
-        reached = [name for name in functions if name in named]
-        bodies = [fork.repo.function(RENDERER, name) for name in reached]
-        more = set().union(named, *(_mentioned(body) for body in bodies if body))
-        if more == named:
-            break
-        named = more
-    trees = [*fork.trees.values(), *filter(None, bodies)]
+    pairs = ((name, fork.repo.function(RENDERER, name)) for name in functions)
+    drawn = {name: body for name, body in pairs if body}
+    while more := {n for name in drawn.keys() & named for n in _mentioned(drawn[name])} - named:
+        named |= more
+    bodies = {name: body for name, body in drawn.items() if name in named}
+    trees = (*fork.trees.values(), *bodies.values())
     called = {getattr(n, "id", getattr(n, "attr", "")) for each in trees for n in nodes(each)}
-    for name in reached:
-        body = fork.repo.function(RENDERER, name)
-        assert body is not None  # it draws
+    for name, body in bodies.items():
         parameters = fork.repo.parameters(RENDERER, name) or ()
         model = next((each for each in _MODEL_ARGUMENTS if each in parameters), "")
         at = f"{RENDERER}:{name} ({fork.repo.place(RENDERER, name)})"
@@ -666,9 +605,8 @@ def _read_draws(fork: Fork) -> None:
         others = [each for each in parameters if each != model]
         camera = next((each for each in others if _CAMERA.match(each)), next(iter(others), ""))
         if not model or not camera or parameters.index(model) < parameters.index(camera):
-            fork.refuse(
-                "rasterizer-call", at, f"arguments {', '.join(parameters)}", "a camera and a model"
-            )
+            found = f"arguments {', '.join(parameters)}"
+            fork.refuse("rasterizer-call", at, found, "a camera and a model")
             continue
         if not calls or not all(call.names for call in calls):
             fork.refuse("rasterizer-call", at, "a result that is not unpacked", "its values")
@@ -703,34 +641,24 @@ def _reached(fork: Fork, node: ast.AST) -> Iterator[str]:
     for kind in ("id", "attr", "name"):
         if isinstance(name := getattr(node, kind, None), str):
             yield name
+    test = node.test if isinstance(node, ast.If) else None
+    taken = reading.decided(fork.repo, fork.options_in, test) if test else None
     for each in ast.iter_child_nodes(node):
-        if isinstance(node, ast.If) and each in node.body and _needs_option(fork, node.test):
+        if taken is not None and each in (node.orelse if taken else node.body):  # type: ignore[attr-defined]
             drawn = graphdeco.drawing_functions(fork.repo, RENDERER)
             if not _mentioned(each).isdisjoint(drawn):
-                tests = [n.attr for n in nodes(node.test) if isinstance(n, ast.Attribute)]
-                fork.options |= {name for name in tests if fork.is_off(name)}
+                fork.options |= {n.attr for n in nodes(test) if isinstance(n, ast.Attribute)}
             continue
         yield from _reached(fork, each)
-
-
-def _needs_option(fork: Fork, test: ast.expr) -> bool:
-    if isinstance(test, ast.BoolOp) and isinstance(test.op, ast.And):
-        return any(_needs_option(fork, each) for each in test.values)
-    return isinstance(test, ast.Attribute) and fork.is_off(test.attr)
-
-
-def _by_default(fork: Fork, node: ast.AST) -> Iterator[ast.AST]:
-    """A script without what it does under an option that is off by default."""
-    yield node
-    for each in ast.iter_child_nodes(node):
-        if not (isinstance(node, ast.If) and each in node.body and _needs_option(fork, node.test)):
-            yield from _by_default(fork, each)
 
 
 def _check_call(fork: Fork, at: str, function: str, call: graphdeco.CallInSource) -> None:
     """Settings and arguments besides the known ones: off, or without a part in the picture."""
     if blended := blended_argument(fork.repo, call):
         fork.blended[call.package] = blended
+    if call.other_matrix:
+        found = f"projmatrix is {call.other_matrix}"
+        fork.refuse("rasterizer-call", at, found, "the cameras of 3DGS")
     if POSES & call.arguments:
         fork.warn("rasterizer-call", at, "the cameras, which stand still in stage 2")
     screens = frozenset(filter(_SCREEN.fullmatch, call.arguments))
@@ -746,12 +674,8 @@ def _check_call(fork: Fork, at: str, function: str, call: graphdeco.CallInSource
             fork.scaled |= {name}
             fork.warn("rasterizer-call", at, f"the gradient on the screen, which {name} changes")
     if unknown:
-        fork.refuse(
-            "rasterizer-call",
-            at,
-            f"{', '.join(sorted(unknown))}, unknown to fragprune",
-            "settings and arguments whose effect is known",
-        )
+        found = f"{', '.join(sorted(unknown))}, unknown to fragprune"
+        fork.refuse("rasterizer-call", at, found, "settings and arguments whose effect is known")
 
 
 def _stays_off(fork: Fork, function: str, value: ast.expr | None) -> bool:
@@ -765,15 +689,10 @@ def _stays_off(fork: Fork, function: str, value: ast.expr | None) -> bool:
     if value.id not in off_by_default(body):
         return False
     number = names.index(value.id) if value.id in names else len(names)
-    for tree in fork.trees.values():
-        for node in ast.walk(tree):
-            passed = {each.arg: each.value for each in getattr(node, "keywords", ())}
-            if value.id in passed and not _stays_off(fork, "", passed[value.id]):
-                return False
-            draws = isinstance(node, ast.Call) and getattr(node.func, "id", "") == function
-            if draws and len(node.args) > number:  # type: ignore[attr-defined]
-                return False
-    return True
+    calls = [node for tree in fork.trees.values() for node in every(tree, ast.Call)]
+    given = [key.value for node in calls for key in node.keywords if key.arg == value.id]
+    most = max((len(n.args) for n in calls if getattr(n.func, "id", "") == function), default=0)
+    return most <= number and all(_stays_off(fork, "", each) for each in given)
 
 
 # -- outputs ---------------------------------------------------------------------------------------
@@ -787,10 +706,11 @@ def _read_outputs(fork: Fork) -> None:
             roles = tuple(_output(fork, draw, call, number) for number in range(len(call.names)))
             known = fork.outputs.get(package)
             if known is not None and len(known) != len(roles):
-                at = fork.repo.at(RENDERER, call.line)
-                fork.refuse(
-                    "rasterizer-call", at, f"{len(roles)} and {len(known)} values", "one form"
+                at, found = (
+                    fork.repo.at(RENDERER, call.line),
+                    f"{len(roles)} and {len(known)} values",
                 )
+                fork.refuse("rasterizer-call", at, found, "one form")
                 continue
             fork.outputs[package] = tuple(
                 each if each.role != "unread" else former
@@ -799,12 +719,8 @@ def _read_outputs(fork: Fork) -> None:
     for package, roles in fork.outputs.items():
         names = [each.role for each in roles]
         if names[:1] != ["image"] or names.count("radii") != 1:
-            fork.refuse(
-                "rasterizer-output",
-                package,
-                f"values {', '.join(each.name or '?' for each in roles)}",
-                "a picture, and the radii once",
-            )
+            found = f"values {', '.join(each.name or '?' for each in roles)}"
+            fork.refuse("rasterizer-output", package, found, "a picture, and the radii once")
 
 
 def _output(fork: Fork, draw: Draw, call: graphdeco.CallInSource, number: int) -> Output:
@@ -814,19 +730,18 @@ def _output(fork: Fork, draw: Draw, call: graphdeco.CallInSource, number: int) -
     if "radii" in name:
         return Output(name, "radii")
     output = meaning(fork.repo, call, name)
-    uses = _uses(fork, draw, name) if output.role == "unread" else []
-    if uses and _PROVABLE.search(name) and not kernels.normal_sources(fork.repo, package):
+    uses = _uses(fork, draw, name) if output.role in ("unread", "unproved") else []
+    read = output.role == "unread" and kernels.normal_sources(fork.repo, package)
+    if uses and _PROVABLE.search(name) and not read:
         at = fork.repo.at(RENDERER, call.line)
         fork.warn("rasterizer-output", at, f"what {package} returns as {name}")
         return Output(name, "unproved")
     if uses:
-        fork.refuse(
-            "rasterizer-output",
-            f"{RENDERER}:{draw.function} ({fork.repo.at(RENDERER, call.line)})",
-            f"{name}, read in {uses[0]}, whose meaning is unknown",
-            "picture, radii, and sums along the ray whose kernel was read",
-        )
-    return output
+        at = f"{RENDERER}:{draw.function} ({fork.repo.at(RENDERER, call.line)})"
+        found = f"{name}, read in {uses[0]}, whose meaning is unknown"
+        expected = "picture, radii, and sums along the ray whose kernel was read"
+        fork.refuse("rasterizer-output", at, found, expected)
+    return output if output.role != "unproved" else Output(name, "unread")
 
 
 def _uses(fork: Fork, draw: Draw, name: str) -> list[str]:
@@ -835,56 +750,36 @@ def _uses(fork: Fork, draw: Draw, name: str) -> list[str]:
     if body is None or name in ("", "_"):
         return []
     keys: set[str] = set()
-    handed: set[int] = set()
-    for node in ast.walk(body):
-        pairs: list[tuple[ast.expr | None, ast.expr]] = []
-        if isinstance(node, ast.Dict):
-            pairs = list(zip(node.keys, node.values, strict=True))
-        elif isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Subscript):
-            pairs = [(node.targets[0].slice, node.value)]
-        for key, value in pairs:
-            while isinstance(value, ast.Call) and getattr(value.func, "attr", "") in HANDED:
-                value = value.func.value  # type: ignore[attr-defined]
-            if isinstance(key, ast.Constant) and getattr(value, "id", "") == name:
-                keys.add(str(key.value))
-                handed.add(id(value))
+    handed: set[ast.AST] = set()
+    dicts = every(body, ast.Dict)
+    pairs = [pair for each in dicts for pair in zip(each.keys, each.values, strict=True)]
+    pairs += [(to.slice, value) for to, value in assigned(body) if isinstance(to, ast.Subscript)]
+    for key, value in pairs:
+        while isinstance(value, ast.Call) and getattr(value.func, "attr", "") in HANDED:
+            value = value.func.value  # type: ignore[attr-defined]
+        if isinstance(key, ast.Constant) and getattr(value, "id", "") == name:
+            keys.add(str(key.value))
+            handed.add(value)
     places = [
         fork.repo.at(RENDERER, node.lineno)
-        for node in ast.walk(body)
-        if isinstance(node, ast.Name)
-        and node.id == name
-        and isinstance(node.ctx, ast.Load)
-        and id(node) not in handed
+        for node in every(body, ast.Name)
+        if node.id == name and isinstance(node.ctx, ast.Load) and node not in handed
     ]
     for module, tree in fork.trees.items():
-        passed = {
-            id(inner)
-            for node, method in _method_calls(tree)
-            if method in fork.still
-            for inner in ast.walk(node)
-        }
-        passed |= _only_named(tree)
-        for node in _by_default(fork, tree):
+        still = (node for node, method in _method_calls(tree) if method in fork.still)
+        passed = {inner for node in still for inner in nodes(node)} | _only_named(tree)
+        for node in reading.by_default(fork.repo, fork.options_in, tree):
             read = isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Load)
             index = node.slice if read else None  # type: ignore[attr-defined]
             if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "get":
                 index = node.args[0] if node.args else None
-            if getattr(index, "value", None) in keys and keys and id(node) not in passed:
+            if getattr(index, "value", None) in keys and keys and node not in passed:
                 places.append(fork.repo.at(module, node.lineno))  # type: ignore[attr-defined]
     return places
 
 
-def _only_named(tree: ast.AST) -> set[int]:
+def _only_named(tree: ast.AST) -> set[ast.AST]:
     """Values that a script gives a name, and never reads by it."""
-    read = {
-        node.id
-        for node in nodes(tree)
-        if isinstance(node, ast.Name) and not isinstance(node.ctx, ast.Store)
-    }
-    named = set[int]()
-    for node in (each for each in nodes(tree) if isinstance(each, ast.Assign)):
-        target, value = node.targets[0], node.value
-        several = isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple)
-        pairs = zip(target.elts, value.elts, strict=False) if several else [(target, value)]  # type: ignore[attr-defined]
-        named |= {id(v) for t, v in pairs if isinstance(t, ast.Name) and t.id not in read}
-    return named
+    read = {n.id for n in every(tree, ast.Name) if not isinstance(n.ctx, ast.Store)}
+    given = ((target, value) for target, value in assigned(tree) if isinstance(target, ast.Name))
+    return {value for target, value in given if target.id not in read}

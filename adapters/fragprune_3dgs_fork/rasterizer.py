@@ -10,21 +10,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import fragprune_graphdeco as graphdeco
-from fragprune_graphdeco import kernels
+from fragprune_graphdeco import assigned, every, kernels
 from fragprune_plugins.adapting import HostRepo, is_off
 
-Role = Literal[
-    "image",
-    "radii",
-    "depth",
-    "invdepth",
-    "alpha",
-    "objects",
-    "count",
-    "weight",
-    "unproved",
-    "unread",
-]
+Sum = Literal["count", "weight"]
+Role = (
+    Sum | Literal["image", "radii", "depth", "invdepth", "alpha", "objects", "unproved", "unread"]
+)
 
 _Z = r"depths\[collected_id\[j\]\]"
 _DECLARED = re.compile(r"(?:float|auto)(\w+)=([^;]+);")
@@ -74,11 +66,17 @@ def meaning(repo: HostRepo, call: graphdeco.CallInSource, name: str) -> Output:
         whole = made is not None and "kInt" in made[0]
         return Output(name, role, column=bool(made and made[1]), integer=whole)
     blended, (moved, flat) = blended_argument(repo, call), _moving(repo, call.package)
+    depths, weights = set(_DEPTH.findall(text)), set(_WEIGHT.findall(text))
+    shares = {f"{depth}/{weight}" for depth in depths for weight in weights}
+    if "T=test_T;" in text:
+        weights.add("1-T")
     if "depth" in name:
-        for rule, known in ((_DEPTH, "depth"), (_INVERSE, "invdepth")):
-            if _written(text, name, "depth", rule):
-                return Output(name, known, detached=flat)  # type: ignore[arg-type]
-    elif re.search(r"alpha|acc|opac", name) and _written(text, name, "alpha|opac", _WEIGHT):
+        inverse = set(_INVERSE.findall(text))
+        known = {"depth": depths, "invdepth": inverse, "unproved": shares}
+        for each, sums in known.items():
+            if _written(text, name, "depth", sums):
+                return Output(name, each, detached=flat)  # type: ignore[arg-type]
+    elif re.search(r"alpha|acc|opac", name) and _written(text, name, "alpha|opac", weights):
         return Output(name, "alpha", detached=flat)
     elif blended and moved is not None and _words(name) & _words(_blended(text)):
         return Output(name, "objects", detached=not moved)
@@ -107,16 +105,13 @@ def _inlined(text: str) -> str:
     return text
 
 
-def _written(text: str, name: str, buffer: str, rule: re.Pattern[str]) -> bool:
-    """Whether a sum, and nothing else, goes into the buffer that is called most like a value."""
+def _written(text: str, name: str, buffer: str, sums: set[str]) -> bool:
+    """Whether sums, and nothing else, go into the buffer that is called most like a value."""
     stored: dict[str, set[str]] = {}
     for own, value in re.findall(rf"\b(?:out_)?(\w*(?:{buffer})\w*)\[pix_id\]=([^;]+);", text):
         stored.setdefault(own, set()).add(value)
     named = [each for each in stored if _words(each) <= _words(name)]
     values = set().union(*(stored[each] for each in named or stored))
-    sums = set(rule.findall(text))
-    if rule is _WEIGHT and "T=test_T;" in text:
-        sums.add("1-T")
     return bool(values) and values <= sums
 
 
@@ -142,7 +137,7 @@ def _words(name: str) -> set[str]:
     return {word.rstrip("s") for word in name.split("_")}
 
 
-def _sum_for_gaussians(text: str, name: str) -> Literal["count", "weight"] | None:
+def _sum_for_gaussians(text: str, name: str) -> Sum | None:
     """Whether a buffer of this name counts a Gaussian's drawn fragments, or sums their weights."""
     added = [match for match in _ADDED.finditer(text) if match[2] == name]
     if len(added) != 1 or len(re.findall(rf"atomic\w+\(&\(?{name}\[", text)) != 1:
@@ -186,32 +181,21 @@ def _binding(repo: HostRepo, package: str) -> Iterator[ast.AST]:
 
 
 def _reads(function: ast.FunctionDef, setting: str) -> bool:
-    return any(getattr(node, "attr", "") == setting for node in ast.walk(function))
+    return any(node.attr == setting for node in every(function, ast.Attribute))
 
 
 def _changed(forward: ast.FunctionDef, backward: ast.FunctionDef) -> frozenset[str] | None:
     """Parameters of ``forward`` whose gradients are not what the kernels gave."""
-    given: set[str] = set()
-    for node in ast.walk(backward):
-        if isinstance(node, ast.Assign) and "_backward(" in ast.unparse(node.value):
-            target = node.targets[0]
-            given |= {getattr(each, "id", "") for each in getattr(target, "elts", [target])}
-    for node in ast.walk(backward):
-        if isinstance(node, ast.Assign | ast.AugAssign) and "_backward(" not in ast.unparse(node):
-            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            given -= {ast.unparse(each).split("[")[0] for each in targets}
+    made = {to: value for to, value in assigned(backward) if "_backward(" in ast.unparse(value)}
+    given = {getattr(each, "id", "") for to in made for each in getattr(to, "elts", [to])}
+    changed = [to for to, _ in assigned(backward) if to not in made]
+    changed += [each.target for each in every(backward, ast.AugAssign)]
+    given -= {ast.unparse(each).split("[")[0] for each in changed}
     last = backward.body[-1]
     returned = last.value if isinstance(last, ast.Return) else None
     if isinstance(returned, ast.Name):
-        name = returned.id
-        returned = next(
-            (
-                node.value
-                for node in ast.walk(backward)
-                if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == name
-            ),
-            None,
-        )
+        values = (value for to, value in assigned(backward) if ast.unparse(to) == returned.id)
+        returned = next(values, None)
     if not isinstance(returned, ast.Tuple):
         return None
     names = [each.arg for each in forward.args.args[1:]]

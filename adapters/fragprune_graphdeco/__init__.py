@@ -28,15 +28,11 @@ from fragprune_graphdeco.adapter import (
     optimizers,
     rasterizer_seam,
 )
-from fragprune_graphdeco.call import (
-    CallInSource,
-    RasterizerCall,
-    drawing_functions,
-    read_calls,
-)
+from fragprune_graphdeco.call import CallInSource, RasterizerCall, drawing_functions, read_calls
 from fragprune_graphdeco.densifying import clones, needy, reaches, splits
 from fragprune_graphdeco.kernels import SURFEL
 from fragprune_graphdeco.plain import read_models
+from fragprune_graphdeco.reading import assigned, every
 from fragprune_plugins.adapting import HostRepo, Plain, hookimpl
 
 __all__ = [
@@ -48,9 +44,11 @@ __all__ = [
     "GraphdecoAdapter",
     "GraphdecoDialect",
     "RasterizerCall",
+    "assigned",
     "clones",
     "default",
     "drawing_functions",
+    "every",
     "group_names",
     "model_seam",
     "needy",

@@ -16,13 +16,14 @@ from fragprune_graphdeco.call import RasterizerCall, drawing_functions, read_cal
 from fragprune_graphdeco.densifying import clones, splits
 from fragprune_graphdeco.kernels import SPLAT, Kernel, read_kernels, vendored
 from fragprune_graphdeco.reading import (
-    compiled,
     defaults,
+    entries,
+    every,
+    failing,
     made_models,
     module_of,
     read_flags,
     read_getters,
-    renamed,
     training_scripts,
 )
 from fragprune_plugins.adapting import (
@@ -46,7 +47,6 @@ from fragprune_plugins.adapting import (
     SeamCall,
     Splats,
     View,
-    nodes,
     replacing,
 )
 
@@ -279,26 +279,20 @@ class GraphdecoAdapter(ScriptAdapter):
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
         """Check scripts and flags, the host's own names, the model, and the rasterizer."""
-        missing = [
-            f"no {name}" for name in self.scripts_of(repo) if not (repo.root / name).is_file()
-        ]
+        missing = []
         for script in self.scripts_of(repo):
+            missing += [] if (repo.root / script).is_file() else [f"no {script}"]
             made = made_models(repo, module_of(script))
             if made and "GaussianModel" not in made:
                 missing.append(f"{script} makes {', '.join(dict.fromkeys(made))}")
         for module, _, name in (each.rpartition(":") for each in self.own_names):
             module = module or MODEL
             missing += [] if repo.mentions([module], [name]) else [f"no {name} in {module}"]
-        missing += [*renamed(repo), *compiled(repo, self.scripts_of(repo))]
-        packages = dict.fromkeys([self.package, *(each.package for each in self.calls)])
+        missing += failing(repo, self.scripts_of(repo))
+        packages = dict.fromkeys([self.package, *(c.package for c in self.calls if c.package)])
         return [
             *self.other_host(repo, missing),
-            *(
-                finding
-                for package in packages
-                if package
-                for finding in read_kernels(repo, package, self.kernel)
-            ),
+            *(each for name in packages for each in read_kernels(repo, name, self.kernel)),
             *read_getters(repo, MODEL),
             *(read_flags(repo, self.command_line(repo)) if repo.tree(MODEL) else ()),
             *self._groups(repo),
@@ -310,12 +304,15 @@ class GraphdecoAdapter(ScriptAdapter):
         """An error for each input of the rasterizer that is made of other values."""
         module, accepted = self._accepted()
         values = ", ".join(("the values of 3DGS", *self.drawn_from))
-        return [
-            Finding.error("drawn-values", f"{module}:{name}", reason, f"a drawing of {values}")
-            for name in dict.fromkeys(each.function for each in accepted)
-            if (body := repo.function(module, name))
-            for reason, _ in plain.Drawing(repo, module, body, self.drawn_from).inputs()
-        ]
+        found = []
+        for name in dict.fromkeys(each.function for each in accepted):
+            body = repo.function(module, name)
+            drawn = plain.Drawing(repo, module, body, self.drawn_from).inputs() if body else ()
+            found += [(name, reason, f"a drawing of {values}") for reason, _ in drawn]
+            returned = (each.value for each in every(body, ast.Return))
+            if body and any(isinstance(n, ast.Dict) and not plain.pictures(n) for n in returned):
+                found.append((name, "it returns no render", "the picture under this name"))
+        return [Finding.error("drawn-values", f"{module}:{name}", *each) for name, *each in found]
 
     def _groups(self, repo: HostRepo) -> list[Finding]:
         """An error if the source spells out other param groups."""
@@ -339,7 +336,7 @@ class GraphdecoAdapter(ScriptAdapter):
             for each in calls:
                 own = each.package == self.package
                 call = replace(each, package="") if own else each
-                if not any(known.answers(call) for known in accepted):
+                if call.other_matrix or not any(known.answers(call) for known in accepted):
                     found.append((name, repo.at(renderer, each.line), str(call), expected))
             if not calls:
                 nothing = "no settings passed by keyword, or they are made elsewhere"
@@ -383,8 +380,8 @@ class GraphdecoAdapter(ScriptAdapter):
         """``scripts``; where a checkout has none of them, its own that train one GaussianModel."""
         if any((repo.root / name).is_file() for name in self.scripts):
             return self.scripts
-        trains = training_scripts(repo, "*train*.py")
-        one = (each for each in trains if len(repo.calls(each[:-3], "GaussianModel")) == 1)
+        trains = training_scripts(repo)
+        one = (each for each in trains if len(repo.calls(module_of(each), "GaussianModel")) == 1)
         return tuple(one) or self.scripts
 
     def command_line(self, repo: HostRepo) -> CommandLine:
@@ -454,31 +451,17 @@ class GraphdecoAdapter(ScriptAdapter):
         from fragprune_plugins.adapting import thresholds_of
 
         m = self.read_model(ply)
-        rows = len(m.xyz)
-        tensors = dict(
-            zip(
-                [group.name for group in GROUPS],
-                (m.xyz, m.f_dc, m.f_rest, m.opacity, m.scaling, m.rotation),
-                strict=True,
-            )
-        )
-        parameters = {name: torch.nn.Parameter(tensor) for name, tensor in tensors.items()}
-        optimizer = getattr(torch.optim, self.optimizer)(
-            [{"params": [p], "lr": 0.0, "name": name} for name, p in parameters.items()],
-            lr=0.0,
-            eps=1e-15,
-        )
+        rows, names = len(m.xyz), [group.name for group in GROUPS]
+        values = (m.xyz, m.f_dc, m.f_rest, m.opacity, m.scaling, m.rotation)
+        parameters = {k: torch.nn.Parameter(v) for k, v in zip(names, values, strict=True)}
+        groups = [{"params": [p], "lr": 0.0, "name": name} for name, p in parameters.items()]
+        optimizer = getattr(torch.optim, self.optimizer)(groups, lr=0.0, eps=1e-15)
         state: dict[str, Any] = optimizer.state_dict()
         if (store := thresholds_of(ply, rows)) is not None:
             state[CHECKPOINT_KEY] = store.state_dict()
         return (
             m.sh_degree,
-            parameters["xyz"],
-            parameters["f_dc"],
-            parameters["f_rest"],
-            parameters["scaling"],
-            parameters["rotation"],
-            parameters["opacity"],
+            *(parameters[k] for k in ("xyz", "f_dc", "f_rest", "scaling", "rotation", "opacity")),
             torch.zeros(rows),
             torch.zeros(rows, 1),
             torch.zeros(rows, 1),
@@ -507,7 +490,10 @@ class GraphdecoAdapter(ScriptAdapter):
     def not_drawn(self, repo: HostRepo, arguments: list[str]) -> list[str]:
         """What of a command our readers would draw otherwise."""
         flags = (flag for flag in self.undrawn_flags if flag in arguments)
-        return [f"{flag}, which our readers do not support" for flag in flags]
+        projection = repo.function("utils.graphics_utils", "getProjectionMatrix")
+        pinhole = projection is None or "[3, 2]" in ast.unparse(projection)
+        other = [] if pinhole else ["its getProjectionMatrix, which is no pinhole camera's"]
+        return [f"{flag}, which our readers do not support" for flag in flags] + other
 
     def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any]:
         """No fields: vanilla's rules apply."""
@@ -548,14 +534,9 @@ class GraphdecoAdapter(ScriptAdapter):
 
 def group_names(function: Function | None) -> tuple[str, ...]:
     """Names of the param groups that a function spells out as dicts, in source order."""
-    dicts = [node for node in nodes(function) if isinstance(node, ast.Dict)]
-    names = [
-        (value.lineno, value.col_offset, str(value.value))
-        for each in dicts
-        for key, value in zip(each.keys, each.values, strict=True)
-        if isinstance(key, ast.Constant) and key.value == "name" and isinstance(value, ast.Constant)
-    ]
-    return tuple(name for _, _, name in sorted(names))
+    named = (each for each in entries(function, "name") if isinstance(each, ast.Constant))
+    ordered = sorted(named, key=lambda each: (each.lineno, each.col_offset))
+    return tuple(str(each.value) for each in ordered)
 
 
 def resolution(repo: HostRepo, asked: int | None) -> Resolution:
@@ -567,19 +548,18 @@ def resolution(repo: HostRepo, asked: int | None) -> Resolution:
     Raises:
         NotComparedError: the host chooses sizes in another way.
     """
-    everything = nodes(repo.tree(CAMERAS))
+    tree = repo.tree(CAMERAS)
     divisors = {
         element.value
-        for node in everything
-        if isinstance(node, ast.Compare)
-        and isinstance(node.ops[0], ast.In)
+        for node in every(tree, ast.Compare)
+        if isinstance(node.ops[0], ast.In)
         and isinstance(node.left, ast.Attribute)
         and node.left.attr == "resolution"
         and isinstance(node.comparators[0], ast.List | ast.Tuple)
         for element in node.comparators[0].elts
         if isinstance(element, ast.Constant) and isinstance(element.value, int)
     }
-    capped = any(isinstance(node, ast.Constant) and node.value == WIDEST for node in everything)
+    capped = any(node.value == WIDEST for node in every(tree, ast.Constant))
     value = int(default(repo, "_resolution", -1)) if asked is None else asked
     if not divisors or not capped or (value < 1 and value != -1):
         raise NotComparedError(

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
+from fragprune_graphdeco.reading import assigned, every
 from fragprune_plugins.adapting import Function, HostRepo, nodes
 
 SETTINGS, RASTERIZER = "GaussianRasterizationSettings", "GaussianRasterizer"
@@ -73,6 +75,17 @@ class CallInSource(RasterizerCall):
     names: tuple[str, ...] = ()
     given: Mapping[str, ast.expr] = field(default_factory=dict, compare=False)
 
+    @property
+    def other_matrix(self) -> str:
+        """What it passes as the projection, if that is called by another name; "" if not."""
+        matrix = self.given.get("projmatrix")
+        text = ast.unparse(matrix) if isinstance(matrix, ast.Attribute) else ""
+        return "" if re.search("proj|full|mvp", text) else text
+
+    def __str__(self) -> str:
+        projects = f", projmatrix is {self.other_matrix}" if self.other_matrix else ""
+        return f"{super().__str__()}{projects}"
+
 
 def drawing_functions(repo: HostRepo, module: str) -> list[str]:
     """Functions and methods of a module that make settings for a rasterizer, in source order."""
@@ -136,20 +149,16 @@ def _drawn(
     """Line, package, names of the values, of those that are taken of them later, and arguments of
     every call of the rasterizer.
     """
-    assigned = [node for node in nodes(body) if isinstance(node, ast.Assign)]
-    targets = {id(node.value): node.targets[0] for node in assigned}
-    rasterizers = {
-        node.targets[0].id: node.value
-        for node in assigned
-        if imported.of(node.value, RASTERIZER) and isinstance(node.targets[0], ast.Name)
-    }
-    for node in (each for each in nodes(body) if isinstance(each, ast.Call)):
+    targets = {value: target for target, value in assigned(body)}
+    named = ((to, value) for value, to in targets.items() if isinstance(to, ast.Name))
+    rasterizers = {to.id: value for to, value in named if imported.of(value, RASTERIZER)}
+    for node in every(body, ast.Call):
         called = node.func
         if isinstance(called, ast.Attribute) and called.attr != "markVisible":
             called = called.value  # another method that draws
         own = imported.of(called, RASTERIZER)
         if own or getattr(called, "id", None) in rasterizers:
-            target = targets.get(id(node), node)
+            target = targets.get(node, node)
             values = [getattr(each, "id", "") for each in getattr(target, "elts", [])]
             made: ast.Call = called if own else rasterizers[called.id]  # type: ignore[attr-defined, assignment]
             keywords = [each for each in made.keywords if each.arg != "raster_settings"]
@@ -168,25 +177,25 @@ def _taken(body: Function, whole: str) -> tuple[str, ...]:
     Of several lengths that it asks for the greatest; () if it does anything else with the result.
     """
     taken, known = dict[int, set[str]](), 0
-    for node in (each for each in nodes(body) if isinstance(each, ast.Assign)):
+    for node in every(body, ast.Assign):
         target = node.targets[0]
         if whole and getattr(node.value, "id", "") == whole:
             names = [getattr(each, "id", "") for each in getattr(target, "elts", ())]
             known += bool(names)
             for number, name in enumerate(names):
                 taken.setdefault(number, set()).add(name)
-        for each in nodes(node.value):
-            index = getattr(each.slice, "value", None) if isinstance(each, ast.Subscript) else None
-            if type(index) is int and ast.unparse(each.value) == whole:  # type: ignore[attr-defined]
+        for each in every(node.value, ast.Subscript):
+            index = getattr(each.slice, "value", None)
+            if type(index) is int and ast.unparse(each.value) == whole:
                 taken.setdefault(index, set()).add(getattr(target, "id", ""))
                 known += 1
     lengths = sum(ast.unparse(each) == f"len({whole})" for each in nodes(body))
-    reads = [each for each in nodes(body) if isinstance(each, ast.Name) and each.id == whole]
+    reads = [each for each in every(body, ast.Name) if each.id == whole]
     stored = sum(isinstance(each.ctx, ast.Store) for each in reads)
     if known + lengths + stored != len(reads) or any(len(each) > 1 for each in taken.values()):
         return ()
-    every = range(max(taken, default=-1) + 1)
-    return tuple("".join(taken.get(number, ())) for number in every)
+    numbers = range(max(taken, default=-1) + 1)
+    return tuple("".join(taken.get(number, ())) for number in numbers)
 
 
 class _Imported:

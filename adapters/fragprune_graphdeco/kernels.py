@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 from weakref import WeakKeyDictionary
 
 from fragprune_plugins.adapting import Finding, HostRepo
@@ -37,6 +38,11 @@ _POLYNOMIAL = re.compile(r"[\w.+()-]*(?:\*[\w.+()-]+){5,}")
 _LAUNCH = re.compile(r"\b(\w+)\s*(?:<[^<>;]*>)?\s*<<\s*<")
 _KERNEL = re.compile(r"__global__[^;{(]*?(?:__launch_bounds__\s*\([^)]*\)\s*)?(\w+)\s*\(")
 _LOW_PASS = 0.3
+_LEVELS: dict[bool, tuple[Literal["error", "warning"], str]] = {
+    True: ("error", "Its pictures are not ours, so no adapter draws them."),
+    False: ("warning", "It was not read any further; compare pictures on the first run."),
+}
+"""Of what surely differs, and of what may: its level, and what to do."""
 ORDER = "order"
 """The code of an error that is of the picture alone: a PLY is drawn in any order."""
 
@@ -176,12 +182,8 @@ class _Project:
                 yield self._finding(self.folder, 0, "no Jacobian of the projection", "EWA's")
             for path, position, text in jacobians:
                 if not _EWA.fullmatch(text):
-                    yield self._finding(
-                        path,
-                        position,
-                        f"another projection, J = {_short(text)}",
-                        "the EWA projection",
-                    )
+                    found = f"another projection, J = {_short(text)}"
+                    yield self._finding(path, position, found, "the EWA projection")
             yield from self._filters()
             for path, position, text in self._found(_ORDER):
                 if not re.fullmatch(r"\w*view\w*\.z", text):
@@ -209,11 +211,8 @@ class _Project:
         if not known and not unread:
             others = [each for each in self._found(_BRANCHES) if "exp(" not in each[2]]
             path, position, text = next(iter(others), (self.folder, 0, ""))
-            what = (
-                f"alpha = {_short(text)}: no exp()"
-                if text
-                else "no alpha = min(0.99, opacity exp())"
-            )
+            absent = "no alpha = min(0.99, opacity exp())"
+            what = f"alpha = {_short(text)}: no exp()" if text else absent
             yield self._finding(path, position, what, kernel.says)
 
     def _launched(self) -> set[str]:
@@ -253,14 +252,14 @@ class _Project:
             try:
                 width = float(text)
             except ValueError:  # a name: a setting, which the call must pass, or a constant
-                constant = list(
-                    self._found(re.compile(rf"\b{re.escape(text)}\s*=?\s*([\d.]+)f?\b"))
-                )
+                defined = re.compile(rf"\b{re.escape(text)}\s*=?\s*([\d.]+)f?\b")
+                constant = list(self._found(defined))
                 width = float(constant[0][2]) if constant else _LOW_PASS
+                if not constant and self._assigned(path, len(self.texts[path]), text):
+                    yield self._finding(path, position, f"Gaussians widened by {text}", "by 0.3")
             if width != _LOW_PASS:
-                yield self._finding(
-                    path, position, f"a low-pass filter of {width:g}", f"one of {_LOW_PASS}"
-                )
+                found = f"a low-pass filter of {width:g}"
+                yield self._finding(path, position, found, f"one of {_LOW_PASS}")
 
     def _found(self, pattern: re.Pattern[str]) -> Iterator[tuple[Path, int, str]]:
         """File, position and normalised value of each match."""
@@ -274,16 +273,8 @@ class _Project:
         at = path.relative_to(self.repo.root).as_posix()
         if path in self.texts:
             at += f":{self.texts[path].count(chr(10), 0, position) + 1}"
-        return Finding(
-            "error" if error else "warning",
-            "kernel",
-            f"{self.package} ({at})",
-            found,
-            expected,
-            "Its pictures are not ours, so no adapter draws them."
-            if error
-            else "It was not read any further; compare pictures on the first run.",
-        )
+        level, remedy = _LEVELS[error]
+        return Finding(level, "kernel", f"{self.package} ({at})", found, expected, remedy)
 
 
 def _short(text: str) -> str:

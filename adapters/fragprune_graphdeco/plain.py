@@ -14,9 +14,16 @@ from pathlib import Path
 from weakref import WeakKeyDictionary
 
 from fragprune_graphdeco import reading
-from fragprune_graphdeco.call import RASTERIZER, read_calls
+from fragprune_graphdeco.call import ARGUMENTS, RASTERIZER, read_calls
 from fragprune_graphdeco.kernels import ORDER, SPLAT, read_kernels
-from fragprune_graphdeco.reading import ACTIVATIONS, defaults, made_models, returns
+from fragprune_graphdeco.reading import (
+    ACTIVATIONS,
+    assigned,
+    defaults,
+    every,
+    made_models,
+    returns,
+)
 from fragprune_plugins.adapting import (
     Function,
     HostRepo,
@@ -47,6 +54,8 @@ _ADDED = re.compile(r"bg_color|zeros_like\(\w+\)$|\* 0\.0$")
 """What is added to a picture and leaves its Gaussians alone: a background, or zeros."""
 _PICTURES = re.compile(r"mesh_\w+|\w+_(rgb|colou?rs?)")
 """Arguments of a rasterizer that are pictures to blend with its own."""
+_RASTERIZER = re.compile(r"(self\.)?\w*rasterizer")
+"""What drawing functions call a rasterizer that they made."""
 _GSPLAT = {
     **{"means": "means3D", "quats": "rotations", "scales": "scales"},
     **{"opacities": "opacities", "colors": "colors_precomp"},
@@ -152,9 +161,8 @@ def _saving(repo: HostRepo, modules: Iterable[str], *methods: str) -> Iterator[t
 
 def _trained(repo: HostRepo) -> list[str]:
     """The training scripts and what they import of a codebase."""
-    paths = [*sorted(repo.root.glob("*train*.py")), *sorted(repo.root.glob("*/*train*.py"))]
-    names = (path.relative_to(repo.root).with_suffix("").parts for path in paths)
-    return [*reading.reached(repo, map(".".join, names))]
+    deeper = (f"{path.parent.name}.{path.stem}" for path in sorted(repo.root.glob("*/*train*.py")))
+    return [*reading.reached(repo, [*_training(repo), *deeper])]
 
 
 def _of_others(repo: HostRepo, module: str, model: str) -> Iterator[str]:
@@ -186,8 +194,8 @@ def _columns(repo: HostRepo, module: str, name: str) -> tuple[Function | None, l
     listed = listed or repo.function(module, f"{name}.save_ply")
     names = dict.fromkeys(
         re.sub(r"_?(\{\})?\d*$", "", node.value)
-        for node in nodes(listed)
-        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+        for node in every(listed, ast.Constant)
+        if isinstance(node.value, str)
     )
     return listed, [each for each in names if each.isidentifier()]
 
@@ -206,19 +214,18 @@ def _of_columns(repo: HostRepo, module: str, name: str) -> Iterator[str]:
 
 def _scales(repo: HostRepo, module: str, name: str) -> Iterator[str]:
     """Gaussians with two scales, or with one."""
-    setup = repo.function(module, f"{name}.create_from_pcd")
-    assigned = [node for node in nodes(setup) if isinstance(node, ast.Assign)]
-    stored = [each for each in assigned if ast.unparse(each.targets[0]) == "self._scaling"]
-    names = {node.id for each in stored for node in nodes(each.value) if isinstance(node, ast.Name)}
-    made = [each for each in assigned if getattr(each.targets[0], "id", "") in names]
-    own = [
-        each for each in getattr(repo.tree(module), "body", ()) if getattr(each, "name", "") == name
-    ]
-    for each in (node for model in own for node in nodes(model) if isinstance(node, ast.Assign)):
-        flat = ast.unparse(each.value).endswith(".repeat(1, 2)")
-        if flat and (each in assigned or "scal" in ast.unparse(each.targets[0])):
-            yield f"its Gaussians are flat, with two scales ({repo.at(module, each.lineno)})"
+    setup = every(repo.function(module, f"{name}.create_from_pcd"), ast.Assign)
+    body = getattr(repo.tree(module), "body", ())
+    model = (each for each in body if getattr(each, "name", "") == name)
+    for each in (node for part in model for node in every(part, ast.Assign)):
+        wide = re.search(r"\.repeat\(1, ([12])\)$", ast.unparse(each.value))
+        if wide and (each in setup or "scal" in ast.unparse(each.targets[0])):
+            what = "flat, with two scales" if wide[1] == "2" else "round, with one scale"
+            yield f"its Gaussians are {what} ({repo.at(module, each.lineno)})"
             return
+    stored = [each.value for each in setup if ast.unparse(each.targets[0]) == "self._scaling"]
+    names = {node.id for each in stored for node in every(each, ast.Name)}
+    made = [each for each in setup if getattr(each.targets[0], "id", "") in names]
     if made and all(ast.unparse(each.value).endswith("[..., None]") for each in made):
         yield f"its Gaussians are round, with one scale ({repo.at(module, made[0].lineno)})"
 
@@ -227,8 +234,8 @@ def _of_saving(repo: HostRepo, module: str, name: str) -> Iterator[str]:
     """Values that are not saved as they are before activation."""
     raw = {"scaling": True, "opacity": True}
     function = repo.function(module, f"{name}.save_ply")
-    for node in nodes(function):
-        if not isinstance(node, ast.Assign) or not isinstance(node.targets[0], ast.Name):
+    for node in every(function, ast.Assign):
+        if not isinstance(node.targets[0], ast.Name):
             continue
         target, value = node.targets[0].id, ast.unparse(node.value)
         at = repo.at(module, node.lineno)
@@ -248,12 +255,11 @@ def _of_saving(repo: HostRepo, module: str, name: str) -> Iterator[str]:
             if re.search(r"self\.\w+ ?[*+/-] ?self\.\w+", value):
                 yield f"save_ply stores a product or sum, {target} = {value[:60]} ({at})"
     setup = repo.function(module, f"{name}.setup_functions")
-    for node in nodes(setup):
-        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Attribute):
-            attribute, value = node.targets[0].attr, ast.unparse(node.value)
-            expected = ACTIVATIONS.get(attribute, (value,))
-            if value not in expected and raw.get(attribute.removesuffix("_activation"), True):
-                yield f"its {attribute} is {value[:50]} ({repo.at(module, node.lineno)})"
+    for node in every(setup, ast.Assign):
+        attribute, value = getattr(node.targets[0], "attr", ""), ast.unparse(node.value)
+        expected = ACTIVATIONS.get(attribute, (value,))
+        if value not in expected and raw.get(attribute.removesuffix("_activation"), True):
+            yield f"its {attribute} is {value[:50]} ({repo.at(module, node.lineno)})"
 
 
 def _of_getters(repo: HostRepo, module: str, name: str) -> Iterator[tuple[str, bool]]:
@@ -273,13 +279,7 @@ def _of_getters(repo: HostRepo, module: str, name: str) -> Iterator[tuple[str, b
 def _of_positions(repo: HostRepo, module: str, name: str) -> Iterator[str]:
     """Positions that no optimizer moves: something else makes them for every picture."""
     setup = repo.function(module, f"{name}.training_setup")
-    trained = " ".join(
-        ast.unparse(value)
-        for node in nodes(setup)
-        if isinstance(node, ast.Dict)
-        for key, value in zip(node.keys, node.values, strict=True)
-        if getattr(key, "value", "") == "params"
-    )
+    trained = " ".join(map(ast.unparse, reading.entries(setup, "params")))
     if "self._opacity" in trained and not re.search(r"self\._xyz\b", trained):
         at = repo.place(module, f"{name}.training_setup")
         yield f"its optimizer does not train positions, which are made otherwise ({at})"
@@ -307,17 +307,11 @@ def _of_makers(repo: HostRepo, module: str, model: str) -> Iterator[str]:
 
 def _of_sums(repo: HostRepo, script: str) -> Iterator[str]:
     """A picture that a training script adds up of several drawings."""
-    tree, drawn = repo.tree(script), set[str]()
-    for node in nodes(tree):
-        if isinstance(node, ast.Assign):
-            target, value = node.targets[0], node.value
-            several = isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple)
-            pairs = zip(target.elts, value.elts, strict=False) if several else [(target, value)]  # type: ignore[attr-defined]
-            for name, made in pairs:
-                picture = isinstance(made, ast.Subscript) and ast.unparse(made.slice) == "'render'"
-                drawn |= {ast.unparse(name)} if picture else set()
-    for node in nodes(tree):
-        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
+    tree = repo.tree(script)
+    parts = ((to, made) for to, made in assigned(tree) if isinstance(made, ast.Subscript))
+    drawn = {ast.unparse(to) for to, made in parts if ast.unparse(made.slice) == "'render'"}
+    for node in every(tree, ast.BinOp):
+        if isinstance(node.op, ast.Add):
             sides = [_terms(each) & drawn for each in (node.left, node.right)]
             if all(sides) and sides[0] != sides[1]:
                 at = repo.at(script, node.lineno)
@@ -333,8 +327,9 @@ def _terms(node: ast.expr) -> set[str]:
 
 
 def _training(repo: HostRepo) -> list[str]:
-    """Modules of the scripts that train, by their names."""
-    return sorted(each.stem for each in repo.root.glob("*train*.py") if each.stem.isidentifier())
+    """Modules of the scripts that train, by their names, or else by what they do."""
+    named = sorted(each.stem for each in repo.root.glob("*train*.py") if each.stem.isidentifier())
+    return named or [*map(reading.module_of, reading.training_scripts(repo))]
 
 
 def _scripts(repo: HostRepo) -> dict[Path, str]:
@@ -390,24 +385,18 @@ def _drawing(repo: HostRepo, module: str) -> list[ast.FunctionDef]:
     """The functions of a module that draw, ``render`` first, then those that return a picture."""
     body = getattr(repo.tree(module), "body", ())
     found = [each for each in body if isinstance(each, ast.FunctionDef) and _call(each)]
-    return sorted(found, key=lambda each: (each.name != "render", not _pictures(each)))
+    return sorted(found, key=lambda each: (each.name != "render", not pictures(each)))
 
 
 def _call(function: ast.AST, off: Collection[str] = ()) -> ast.Call | None:
     """The call that draws, of several one whose picture is returned, and that needs no argument
     that is off.
     """
-    needy = [node for node in nodes(function) if isinstance(node, ast.If) and _needs(node, off)]
-    behind = {id(inner) for node in needy for each in node.body for inner in nodes(each)}
-    calls = [
-        node
-        for node in nodes(function)
-        if isinstance(node, ast.Call) and "means3D" in arguments(node)
-    ]
-    shown = _shown(function)
-    return min(
-        calls, key=lambda each: (each not in shown, id(each) in behind, each.lineno), default=None
-    )
+    needy = [node for node in every(function, ast.If) if _needs(node, off)]
+    behind = {inner for node in needy for each in node.body for inner in nodes(each)}
+    calls = [node for node in every(function, ast.Call) if "means3D" in arguments(node)]
+    order = {each: (each not in _shown(function), each in behind, each.lineno) for each in calls}
+    return min(order, key=order.__getitem__, default=None)
 
 
 def arguments(call: ast.AST | None) -> dict[str, ast.expr]:
@@ -416,26 +405,24 @@ def arguments(call: ast.AST | None) -> dict[str, ast.expr]:
         return {}
     given = {each.arg: each.value for each in call.keywords if each.arg}
     if ast.unparse(call.func).split(".")[-1] != "rasterization":
-        return given
+        drawn = "opacities" in given or _RASTERIZER.fullmatch(ast.unparse(call.func))
+        return given | (dict(zip(ARGUMENTS, call.args, strict=False)) if drawn else {})
     given |= dict(zip(_GSPLAT, call.args, strict=False))
     return {_GSPLAT.get(name, name): value for name, value in given.items()}
 
 
-def _pictures(function: ast.AST) -> list[ast.expr]:
+def pictures(function: ast.AST) -> list[ast.expr]:
     """What a function returns as ``render``."""
-    dicts = [node for node in nodes(function) if isinstance(node, ast.Dict)]
-    pairs = [pair for each in dicts for pair in zip(each.keys, each.values, strict=True)]
-    return [value for key, value in pairs if getattr(key, "value", "") == "render"]
+    return reading.entries(function, "render")
 
 
 def _shown(function: ast.AST) -> list[ast.AST]:
     """The code that makes what a function returns as ``render``."""
     made: dict[str, list[ast.expr]] = {}
-    for node in nodes(function):
-        for target in node.targets if isinstance(node, ast.Assign) else ():
-            first = target.elts[0] if isinstance(target, ast.Tuple) else target
-            made.setdefault(getattr(first, "id", ""), []).append(node.value)  # type: ignore[attr-defined]
-    found: list[ast.AST] = [*_pictures(function)]
+    for target, value in assigned(function):
+        first = target.elts[0] if isinstance(target, ast.Tuple) else target
+        made.setdefault(getattr(first, "id", ""), []).append(value)
+    found: list[ast.AST] = [*pictures(function)]
     for each in found:  # it grows
         if isinstance(each, ast.Name):
             found += made.pop(each.id, [])
@@ -486,20 +473,15 @@ class Drawing:
         self.repo, self.module, self.function = repo, module, function
         self.drawn_from = drawn_from
         arguments = function.args
-        every = [*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs]
-        self.parameters, self.off = {each.arg for each in every}, off_by_default(function)
+        taken = [*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs]
+        self.parameters, self.off = {each.arg for each in taken}, off_by_default(function)
         given = zip(reversed(arguments.args), reversed(arguments.defaults), strict=False)
         self.switches = {
             each.arg for each, v in given if isinstance(getattr(v, "value", None), bool)
         }
         self.values: dict[str, list[ast.expr]] = {}
-        models = [
-            node.value.id
-            for node in nodes(function)
-            if isinstance(node, ast.Attribute)
-            and node.attr.startswith("get_xyz")
-            and isinstance(node.value, ast.Name)
-        ]
+        read = (n for n in every(function, ast.Attribute) if n.attr.startswith("get_xyz"))
+        models = [each.value.id for each in read if isinstance(each.value, ast.Name)]
         self.model = models[0] if models else "pc"
         self.call = call or _call(function, self.off)
         self.colours = set[str]()
@@ -619,18 +601,17 @@ class Drawing:
         yield from self.inputs()
         calls = read_calls(self.repo, self.module, self.function.name)
         names = dict.fromkeys([*arguments(self.call), *(n for each in calls for n in each.given)])
-        if pictures := [each for each in names if _PICTURES.fullmatch(each)]:
-            yield f"its rasterizer also takes {', '.join(pictures)}", False
-        for made in filter(None, map(self._made_into, _pictures(self.function))):
+        if blended := [each for each in names if _PICTURES.fullmatch(each)]:
+            yield f"its rasterizer also takes {', '.join(blended)}", False
+        for made in filter(None, map(self._made_into, pictures(self.function))):
             at = self.repo.at(self.module, made.lineno)
             yield f"its picture is made into {ast.unparse(made)[:60]} ({at})", True
 
     def _others_first(self) -> Iterator[tuple[str, bool]]:
         """Another picture that the rasterizer returns before the one that counts."""
-        made = [node for node in nodes(self.function) if isinstance(node, ast.Assign)]
-        targets = [each.targets[0] for each in made if each.value is self.call]
+        targets = [target for target, value in assigned(self.function) if value is self.call]
         names = [getattr(e, "id", "") for t in targets for e in getattr(t, "elts", ())]
-        shown = {getattr(each, "id", "") for each in _pictures(self.function)} & {*names}
+        shown = {getattr(each, "id", "") for each in pictures(self.function)} & {*names}
         before = names[: min(map(names.index, shown), default=0)]
         if others := [each for each in before if re.search("image|render|rgb|colou?r", each)]:
             yield f"its rasterizer returns another picture first, {others[0]}", False
@@ -657,12 +638,11 @@ class Drawing:
     def _gives_back(self, name: str) -> bool:
         """Whether a function returns first what its first argument is, or begins with."""
         function = self.repo.function(self.module, name)
-        body = nodes(function)
         kept = {each.arg for each in function.args.args[:1]} if function else set()
-        for node in (each for each in body if isinstance(each, ast.Assign)):
-            if getattr(node.value, "id", "") in kept and isinstance(node.targets[0], ast.Tuple):
-                kept |= {getattr(node.targets[0].elts[0], "id", "")}
-        given = [node.value for node in body if isinstance(node, ast.Return)]
+        for target, value in assigned(function):
+            if getattr(value, "id", "") in kept and isinstance(target, ast.Tuple):
+                kept |= {getattr(target.elts[0], "id", "")}
+        given = [node.value for node in every(function, ast.Return)]
         first = [each.elts[0] if isinstance(each, ast.Tuple) else each for each in given]
         return bool(first) and all(getattr(each, "id", "") in kept for each in first)
 
@@ -713,11 +693,13 @@ class Drawing:
 
     def _channels(self, value: ast.expr) -> Iterator[ast.expr]:
         """What the first channels are, where the picture is cut out of more."""
-        made = self.values.get(getattr(value, "id", ""), [value]) if any(self.cuts()) else [value]
-        for each in made:
+        name = getattr(value, "id", "")
+        for each in self.values.get(name, [value]) if any(self.cuts()) else [value]:
             parts = each.args[:1] if isinstance(each, ast.Call) else []
             listed = parts and isinstance(parts[0], ast.Tuple | ast.List)
-            yield parts[0].elts[0] if listed else each  # type: ignore[attr-defined]
+            first = parts[0].elts[0] if listed else each  # type: ignore[attr-defined]
+            if not listed or getattr(first, "id", "") != name:  # else it is joined to itself
+                yield first
 
     def _beside(self, roots: list[str]) -> bool:
         """Whether these are neither the model as a whole nor other values of its rows."""
@@ -727,9 +709,8 @@ class Drawing:
         """What takes channels out of the picture that the rasterizer returns."""
         whole = {
             getattr(target.elts[0] if isinstance(target, ast.Tuple) else target, "id", "")
-            for node in nodes(self.function)
-            if isinstance(node, ast.Assign) and node.value is self.call
-            for target in node.targets
+            for target, value in assigned(self.function)
+            if value is self.call
         } - {""}
         for node in nodes(self.function):
             if isinstance(node, ast.Attribute) and node.attr in ("split", "chunk", "unbind"):

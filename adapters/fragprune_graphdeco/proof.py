@@ -75,11 +75,7 @@ class RasterizerProver(Prover):
             return Proof(trial.where, (), failed=str(error))
 
     def answer(
-        self,
-        call: HostCall,
-        inputs: RasterInputs,
-        draw: Callable[..., RasterOutputs],
-        proof: Proof,
+        self, call: HostCall, inputs: RasterInputs, draw: Callable[..., RasterOutputs], proof: Proof
     ) -> Any:
         """Answer by the dialect, and by what the proof found beyond it.
 
@@ -96,10 +92,7 @@ class RasterizerProver(Prover):
 
 
 def _packed(
-    dialect: Dialect,
-    call: HostCall,
-    inputs: RasterInputs,
-    draw: Callable[..., RasterOutputs],
+    dialect: Dialect, call: HostCall, inputs: RasterInputs, draw: Callable[..., RasterOutputs]
 ) -> tuple[tuple[Any, ...], Seen]:
     """The dialect's answer, and what the engine draws with all meanings."""
     seen: list[Seen] = []

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import ast
+import contextlib
+import operator
 import re
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
+from functools import lru_cache
+from typing import Any, TypeVar
 
 from fragprune_plugins.adapting import (
     CommandLine,
@@ -42,7 +47,7 @@ def read_getters(repo: HostRepo, module: str, unset: Collection[str] = ()) -> li
         name = f"GaussianModel.get_{kind}"
         function, read = repo.function(module, name), kind in ("xyz", "opacity")
         if kind in computed:
-            made = [each.value for each in nodes(function) if isinstance(each, ast.Return)]
+            made = (each.value for each in every(function, ast.Return))
             ends = " or ".join(ast.unparse(each) for each in made if each)
             what = f"get_{kind} is computed, it returns {ends[:60] or 'nothing'}"
         elif read and not (function and is_property(function)):
@@ -65,16 +70,12 @@ def computed_getters(
     getters = {
         each: repo.function(module, f"{model}.get_{each}") for each in (*GETTERS, "features")
     }
-    features = [
-        node
-        for node in nodes(getters.pop("features"))
-        if isinstance(node, ast.BinOp)
-        or (isinstance(node, ast.Call) and ast.unparse(node.func) not in _JOINS)
-    ]
+    own = getters.pop("features")
+    other = any(ast.unparse(each.func) not in _JOINS for each in every(own, ast.Call))
     wanted = {kind: {"stored" if kind == "xyz" else "activated"} for kind in GETTERS}
     return [
         *(k for k, each in getters.items() if each and returns(each, f"_{k}", unset) != wanted[k]),
-        *(["features"] if features else []),
+        *(["features"] if other or every(own, ast.BinOp) else []),
     ]
 
 
@@ -87,19 +88,43 @@ def unset(repo: HostRepo, module: str, model: str) -> set[str]:
     return {each for each, values in nothing.items() if values == {None}}
 
 
+Node = TypeVar("Node", bound=ast.AST)
+
+
+def every(tree: ast.AST | None, *kinds: type[Node]) -> list[Node]:
+    """Those of these kinds among ``nodes``."""
+    return [each for each in nodes(tree) if isinstance(each, kinds)]
+
+
+def assigned(tree: ast.AST | None) -> list[tuple[ast.expr, ast.expr]]:
+    """What gets which value in assignments, one by one where tuples do."""
+    pairs = [(each, node.value) for node in every(tree, ast.Assign) for each in node.targets]
+    several = [(a, b) for a, b in pairs if isinstance(a, ast.Tuple) and isinstance(b, ast.Tuple)]
+    singles = (each for a, b in several for each in zip(a.elts, b.elts, strict=False))
+    return [*(each for each in pairs if each not in several), *singles]
+
+
+def entries(tree: ast.AST | None, name: str) -> list[ast.expr]:
+    """What dicts have under a name."""
+    dicts = every(tree, ast.Dict)
+    pairs = (pair for each in dicts for pair in zip(each.keys, each.values, strict=True))
+    return [value for key, value in pairs if getattr(key, "value", "") == name]
+
+
 def made_models(repo: HostRepo, module: str) -> list[str]:
     """Classes of models that a script makes, by their names, once for each place."""
-    made = [node.func for node in nodes(repo.tree(module)) if isinstance(node, ast.Call)]
-    names = [getattr(each, "id", "") for each in made]
+    names = [getattr(each.func, "id", "") for each in every(repo.tree(module), ast.Call)]
     return [name for name in names if name.endswith("Model") or name.startswith("GaussianModel")]
 
 
 _ELSEWHERE = re.compile(r"\w+(?:\.\w+)*\.(?:scene(?:\.\w+)*|gaussian_renderer)")
 
 
-def renamed(repo: HostRepo) -> list[str]:
-    """Modules of a checkout that its own files import under other names: others, to Python."""
-    return [
+def failing(repo: HostRepo, scripts: Collection[str]) -> list[str]:
+    """Why scripts fail or pass all seams by: modules that are imported under other names, which are
+    others to Python; another framework; compiled training; calls that their functions do not take.
+    """
+    found = [
         f"{path} imports {name}, which is no module of this folder"
         for module in ("gaussian_renderer", "scene", "scene.gaussian_model", "train")
         for node in getattr(repo.tree(module), "body", ())
@@ -108,21 +133,152 @@ def renamed(repo: HostRepo) -> list[str]:
         for path in [repo.at(module, node.lineno)]
         if _ELSEWHERE.fullmatch(name) and not _there(repo, name.split(".")[0])
     ][:1]
+    for script in scripts:
+        tree = repo.tree(module_of(script))
+        found += [f"{script} trains by jittor"] * ("jittor" in imported(tree))
+        found += [
+            f"{script} compiles {node.name}, which trains"
+            for node in every(tree, ast.FunctionDef)
+            if any("torch.compile" in ast.unparse(each) for each in node.decorator_list)
+            and any(getattr(each, "attr", "") == "backward" for each in nodes(node))
+        ]
+        found += _misfits(repo, module_of(script))[:1]
+    return found
 
 
-def compiled(repo: HostRepo, scripts: Collection[str]) -> list[str]:
-    """Functions that scripts compile, and that go backward, and scripts without torch: no seam is
-    reached in them.
+def owners(tree: ast.AST | None) -> set[str]:
+    """Variables, and lists and dicts, that hold models which a script makes."""
+    pairs = assigned(tree)
+    return {ast.unparse(a).split("[")[0] for a, b in pairs if "GaussianModel(" in ast.unparse(b)}
+
+
+@lru_cache(maxsize=64)  # of the adapters, many ask
+def _misfits(repo: HostRepo, module: str) -> tuple[str, ...]:
+    """Calls of the checkout's own functions with values that these do not take, and of methods
+    that the model lacks; without those that a script tries, or makes only where something is
+    given or asked for.
     """
-    jittor = [each for each in scripts if "jittor" in imported(repo.tree(module_of(each)))]
-    return [f"{script} trains by jittor" for script in jittor] + [
-        f"{script} compiles {node.name}, which trains"
-        for script in scripts
-        for node in nodes(repo.tree(module_of(script)))
-        if isinstance(node, ast.FunctionDef)
-        and any("torch.compile" in ast.unparse(each) for each in node.decorator_list)
-        and any(getattr(each, "attr", "") == "backward" for each in nodes(node))
-    ]
+    tree, misfits = repo.tree(module), tuple[str, ...]()
+    parts = [node.body for node in every(tree, ast.If) if isinstance(node.test, ast.Name)]
+    parts += [node.body for node in every(tree, ast.Try)]
+    tried = {inner for part in parts for each in part for inner in nodes(each)}
+    models, model = owners(tree), _definition(repo, "scene.gaussian_model", "GaussianModel")
+    reached = by_default(repo, ("arguments", module), tree) if tree else ()
+    texts = ast.unparse(tree or ast.Pass()) + ast.unparse(model or ast.Pass())
+    for node in (each for each in reached if isinstance(each, ast.Call) and each not in tried):
+        owner, _, name = ast.unparse(node.func).rpartition(".")
+        found, at = None, repo.at(module, node.lineno)
+        if name in ("capture", "restore"):
+            continue
+        if owner in models and isinstance(model, ast.ClassDef):
+            found = next((n for n in model.body if getattr(n, "name", "") == name), None)
+            inherits = model.bases or "setattr(" in texts or f".{name} = " in texts
+            if found is None and not inherits:
+                misfits += (f"calls {name}, which its model lacks ({at})",)
+        elif not owner and _bindings(tree)[name] == 1:
+            found = model if name == "GaussianModel" else _definition(repo, module, name)
+        if why := _misfit(found, node, bool(owner)):
+            misfits += (f"its call of {name} {why}, which fails ({at})",)
+    return misfits
+
+
+@lru_cache(maxsize=64)
+def _bindings(tree: ast.AST | None) -> Counter[str]:
+    """How often a module gives something a name."""
+    kinds = ("name", "asname", "arg", "id")
+    return Counter(
+        name
+        for node in nodes(tree)
+        if not isinstance(node, ast.keyword)
+        and isinstance(getattr(node, "ctx", ast.Store()), ast.Store)
+        for name in {str(getattr(node, kind, None)) for kind in kinds}
+    )
+
+
+def _definition(repo: HostRepo, module: str, name: str, deep: int = 3) -> ast.stmt | None:
+    """The function or class of a name in a module, also one that it imports from the checkout."""
+    for node in getattr(repo.tree(module), "body", ()):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef) and node.name == name:
+            return node
+        for each in node.names if isinstance(node, ast.ImportFrom) and deep else ():
+            if (each.asname or each.name) == name:
+                return _definition(repo, repo.absolute(module, node), each.name, deep - 1)
+    return None
+
+
+def _misfit(called: ast.AST | None, call: ast.Call, of_model: bool) -> str:
+    """How a call's values differ from those that a function, a method or a class takes; "" if they
+    do not, or if that cannot be told.
+    """
+    made = isinstance(called, ast.ClassDef)
+    own = [n for n in getattr(called, "body", ()) if getattr(n, "name", "") == "__init__"]
+    function = (own[0] if own else None) if made else called
+    given = [each.arg for each in call.keywords]
+    loose = None in given or any(isinstance(each, ast.Starred) for each in call.args)
+    if not isinstance(function, ast.FunctionDef) or function.decorator_list or loose:
+        return ""
+    taken, count = function.args, len(call.args)
+    names = [each.arg for each in (*taken.posonlyargs, *taken.args)]
+    needed = names[: len(names) - len(taken.defaults)]
+    names, needed = (each[made or of_model :] for each in (names, needed))
+    free = [*names[count:], *(each.arg for each in taken.kwonlyargs)]
+    if count > len(names) and not taken.vararg:
+        return f"gives {count} values of {len(names)}"
+    more = [each for each in given if each not in free and not taken.kwarg]
+    lacking = [each for each in needed[count:] if each not in given]
+    return f"gives {more[0]}" if more else f"lacks {lacking[0]}" if lacking else ""
+
+
+_COMPARED = {
+    **{ast.Eq: operator.eq, ast.NotEq: operator.ne, ast.Gt: operator.gt, ast.GtE: operator.ge},
+    **{ast.Lt: operator.lt, ast.LtE: operator.le, ast.Is: operator.is_, ast.IsNot: operator.is_not},
+}
+
+
+def by_default(repo: HostRepo, modules: Collection[str], node: ast.AST) -> Iterator[ast.AST]:
+    """A script without the branches that it does not take where options have their defaults."""
+    yield node
+    taken = decided(repo, modules, node.test) if isinstance(node, ast.If) else None
+    for name, value in ast.iter_fields(node):
+        if taken is not None and name == ("orelse" if taken else "body"):
+            continue
+        for each in value if isinstance(value, list) else [value]:
+            if isinstance(each, ast.AST):
+                yield from by_default(repo, modules, each)
+
+
+def decided(repo: HostRepo, modules: Collection[str], test: ast.expr) -> bool | None:
+    """What a test says where options have the defaults that modules give them; None if it asks for
+    anything else.
+    """
+    if isinstance(test, ast.BoolOp):
+        parts = [decided(repo, modules, each) for each in test.values]
+        ends = isinstance(test.op, ast.Or)
+        return ends if ends in parts else None if None in parts else not ends
+    if isinstance(test, ast.UnaryOp) and isinstance(test.op, ast.Not):
+        inner = decided(repo, modules, test.operand)
+        return None if inner is None else not inner
+    compared = isinstance(test, ast.Compare) and _COMPARED.get(type(test.ops[0]))
+    sides = [test.left, *test.comparators] if isinstance(test, ast.Compare) else [test]
+    values = [_by_itself(repo, modules, each) for each in sides]
+    if not all(values) or not any(isinstance(each, ast.Attribute) for each in sides):
+        return None
+    if len(sides) == 1:
+        return bool(values[0][0])
+    with contextlib.suppress(TypeError):
+        return bool(compared(values[0][0], values[1][0])) if compared and len(sides) == 2 else None
+    return None
+
+
+def _by_itself(repo: HostRepo, modules: Collection[str], node: ast.expr) -> list[Any]:
+    """The one value of a constant, or of an option by default; [] if it is not known."""
+    option = isinstance(node, ast.Attribute)
+    given = [v for m in modules for v in defaults(repo, m, node.attr)] if option else [node]  # type: ignore[attr-defined]
+    try:
+        values = [ast.literal_eval(each) for each in given]
+    except (ValueError, TypeError, SyntaxError):
+        return []
+    return values[:1] if all(repr(each) == repr(values[0]) for each in values) else []
 
 
 def module_of(script: str) -> str:
@@ -162,8 +318,7 @@ def returns(getter: Function, stored: str, unset: Collection[str] = ()) -> set[s
             return known.get(value.id, "computed")
         return "stored" if value and ast.unparse(value) == f"self.{stored}" else "computed"
 
-    branches = [node for node in nodes(getter) if isinstance(node, ast.If)]
-    gone = (each for node in branches for each in _skipped(node, unset))
+    gone = (each for node in every(getter, ast.If) for each in _skipped(node, unset))
     skipped = {id(inner) for each in gone for inner in nodes(each)}
     for statement in getter.body:
         for node in (each for each in nodes(statement) if id(each) not in skipped):
@@ -171,8 +326,7 @@ def returns(getter: Function, stored: str, unset: Collection[str] = ()) -> set[s
                 name, made = node.targets[0].id, state(node.value)
                 branch = node is not statement and name in known  # one of several
                 known[name] = "computed" if branch and made != known[name] else made
-    body = [node for node in nodes(getter) if id(node) not in skipped]
-    return {state(node.value) for node in body if isinstance(node, ast.Return)}
+    return {state(n.value) for n in every(getter, ast.Return) if id(n) not in skipped}
 
 
 def _skipped(node: ast.If | ast.IfExp, unset: Collection[str]) -> list[ast.AST]:
@@ -187,18 +341,15 @@ def _skipped(node: ast.If | ast.IfExp, unset: Collection[str]) -> list[ast.AST]:
 def options(repo: HostRepo, module: str, model: str, scripts: Iterable[str]) -> set[str]:
     """What getters ask for that an option of its name, off by default, alone switches on."""
     getters = (repo.function(module, f"{model}.get_{kind}") for kind in GETTERS)
-    tests = [n.test for each in getters for n in nodes(each) if isinstance(n, ast.If | ast.IfExp)]
+    tests = [n.test for each in getters for n in every(each, ast.If, ast.IfExp)]  # type: ignore[attr-defined]
     asked = {n.removeprefix("not ").removeprefix("self.") for n in map(ast.unparse, tests)}
-    assigned = [
-        (ast.unparse(node.targets[0]).split(".")[-1], node.value)
-        for each in (module, *scripts)
-        for node in nodes(repo.tree(each))
-        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Attribute)
-    ]
+    pairs = (pair for each in (module, *scripts) for pair in assigned(repo.tree(each)))
     made = {
-        name
-        for name, value in assigned
-        if not is_off(value) and ast.unparse(value).split(".")[-1] != name
+        target.attr
+        for target, value in pairs
+        if isinstance(target, ast.Attribute)
+        and not is_off(value)
+        and ast.unparse(value).split(".")[-1] != target.attr
     }
     names = {each: each.split(".")[-1] for each in asked}
     values = {k: [*defaults(repo, "arguments", each)] for k, each in names.items()}
@@ -209,9 +360,13 @@ def options(repo: HostRepo, module: str, model: str, scripts: Iterable[str]) -> 
     }
 
 
+SCRIPTS = ("*train*.py", "*.py")
+"""Which files of a folder may be training scripts: those of the first that finds any."""
+
+
 def training_scripts(repo: HostRepo, *patterns: str) -> tuple[str, ...]:
     """Scripts that train, the usual one first, by the first of the patterns that finds any."""
-    for pattern in patterns:
+    for pattern in patterns or SCRIPTS:
         files = sorted(repo.root.glob(pattern), key=lambda each: (each.stem != "train", each))
         paths = [each.relative_to(repo.root) for each in files if "." not in each.stem]
         parts = {each.as_posix(): ".".join(each.with_suffix("").parts) for each in paths}
@@ -236,18 +391,29 @@ def reached(repo: HostRepo, modules: Iterable[str], without: str = "") -> dict[s
     return seen
 
 
-def defaults(repo: HostRepo, module: str, name: str) -> Iterator[ast.expr]:
+def defaults(repo: HostRepo, module: str, name: str) -> list[ast.expr]:
     """What the classes of a module first assign to ``self.name``, and defaults of that option."""
-    for node in nodes(repo.tree(module)):
+    return _defaults(repo.tree(module)).get(name, [])
+
+
+@lru_cache(maxsize=256)
+def _defaults(tree: ast.Module | None) -> dict[str, list[ast.expr]]:
+    """``defaults`` of all names."""
+    found: dict[str, list[ast.expr]] = {}
+    for node in nodes(tree):
         if isinstance(node, ast.FunctionDef) and node.name == "__init__":
-            for each in ast.walk(node):
-                if isinstance(each, ast.Assign) and ast.unparse(each.targets[0]) == f"self.{name}":
-                    yield each.value
+            for made in (each for each in nodes(node) if isinstance(each, ast.Assign)):
+                owner, _, name = ast.unparse(made.targets[0]).partition(".")
+                if owner == "self":
+                    found.setdefault(name, []).append(made.value)
         elif isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "add_argument":
             given = {each.arg: each.value for each in node.keywords}
-            switch = getattr(given.get("action"), "value", "") == "store_true"
-            if any(getattr(each, "value", None) == f"--{name}" for each in node.args):
-                yield given.get("default", ast.Constant(False if switch else None))
+            action = getattr(given.get("action"), "value", "")
+            switch = {"store_true": False, "store_false": True}.get(str(action))
+            for each in filter(None, (getattr(name, "value", "") for name in node.args)):
+                value = given.get("default", ast.Constant(switch))
+                found.setdefault(str(each).removeprefix("--"), []).append(value)
+    return found
 
 
 def read_flags(repo: HostRepo, line: CommandLine) -> list[Finding]:
@@ -258,11 +424,10 @@ def read_flags(repo: HostRepo, line: CommandLine) -> list[Finding]:
         tree = repo.tree(module_of(script))
         if tree is None:
             continue
-        if not any(
-            isinstance(node, ast.Call)
-            and getattr(node.func, "attr", "") in ("parse_args", "parse_known_args")
-            for node in nodes(tree)
-        ):
+        called = (getattr(node.func, "id", "") for node in every(tree, ast.Call))
+        parts = (tree, *(repo.function("arguments", each) for each in called if each))
+        read = {node.attr for each in parts for node in every(each, ast.Attribute)}
+        if read.isdisjoint(("parse_args", "parse_known_args")):
             others = [name for name in imported(tree) if name in _OTHER_FLAGS]
             by = f"it reads its settings with {', '.join(others)}" if others else "no argparse"
             found.append((script, by, "flags, read with argparse"))
@@ -280,10 +445,9 @@ def read_flags(repo: HostRepo, line: CommandLine) -> list[Finding]:
 
 def _strings(tree: ast.Module) -> Iterator[str]:
     """Strings in a script that could be flags."""
-    for node in nodes(tree):
-        value = getattr(node, "value", None) if isinstance(node, ast.Constant) else None
-        if isinstance(value, str) and value.startswith("-"):
-            yield value
+    for node in every(tree, ast.Constant):
+        if isinstance(node.value, str) and node.value.startswith("-"):
+            yield node.value
 
 
 def _of_groups(repo: HostRepo) -> Iterator[str]:
@@ -294,10 +458,8 @@ def _of_groups(repo: HostRepo) -> Iterator[str]:
     for path in sorted((repo.root / "arguments").glob("*.py")):
         tree = repo.tree(f"arguments.{path.stem}") if path.stem != "__init__" else None
         yield from _strings(tree) if tree else ()
-    for node in nodes(repo.tree("arguments")):
-        targets = node.targets if isinstance(node, ast.Assign) else []
-        for each in targets:
-            if isinstance(each, ast.Attribute) and ast.unparse(each.value) == "self":
-                yield f"--{each.attr.removeprefix('_')}"
-                if each.attr.startswith("_"):
-                    yield f"-{each.attr[1]}"
+    for each, _ in assigned(repo.tree("arguments")):
+        if isinstance(each, ast.Attribute) and ast.unparse(each.value) == "self":
+            yield f"--{each.attr.removeprefix('_')}"
+            if each.attr.startswith("_"):
+                yield f"-{each.attr[1]}"

@@ -62,7 +62,7 @@ class Vanilla3DGS(GraphdecoAdapter):
         """What a fork of this interface does otherwise: ``3dgs-fork`` serves it, or nobody does."""
         fork = read_fork(repo)
         if not fork.scripts:  # another model is trained, or no file of that name is Python
-            trains = repo.tree("train") is None or reading.training_scripts(repo, "*train*.py")
+            trains = repo.tree("train") is None or reading.training_scripts(repo)
             return fork.errors if trains else []
         held = (seam for seam in self.seams if seam.role is Role.STILL)
         known = {seam.attribute.rpartition(".")[2] for seam in held} | STATISTICS

@@ -110,11 +110,7 @@ class Prover(ABC):
 
     @abstractmethod
     def answer(
-        self,
-        call: HostCall,
-        inputs: RasterInputs,
-        draw: Callable[..., RasterOutputs],
-        proof: Proof,
+        self, call: HostCall, inputs: RasterInputs, draw: Callable[..., RasterOutputs], proof: Proof
     ) -> Any:
         """Answer a call as ``Dialect.answer`` does, and with the outputs that the proof found."""
 

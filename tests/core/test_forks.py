@@ -37,6 +37,7 @@ SERVED = {
     "a value that nobody reads": {"values": "image, radii, touched"},
     "a value without a name": {"values": "image, radii, _"},
     "confidence": {"settings": ", confidence=pc.confidence"},
+    "a script that only its text tells": {"script": "optimize.py"},
     "a camera that is trained": {
         "settings": ", projmatrix_raw=viewpoint_camera.projection_matrix",
         "arguments": ", theta=viewpoint_camera.turned, rho=viewpoint_camera.moved",
@@ -86,6 +87,8 @@ SAME = {
     "by a name that changes": (None, STORED.format(W + Z + "w *= 2;", "w * z")),
     "in the buffer of the newer rasterizer": ("invdepth", INVERSE.replace("out_inv", "inv")),
     "beside another depth": ("depth", DEPTH + "out_median_depth[pix_id] = M;"),
+    "over the weight": ("unproved", DEPTH.replace("= D", "= D / A") + "A += alpha * T;"),
+    "over something else": (None, DEPTH.replace("= D", "= D / B") + "A += alpha * T;"),
     "what light is left": ("alpha", "T = test_T; out_alpha[pix_id] = 1 - T;"),
     "what light another left": (None, "T = test_T * x; out_alpha[pix_id] = 1 - T;"),
 }
@@ -511,6 +514,7 @@ def test_a_script_that_can_resume_does(tmp_path):
 
 MOVED = [
     ("pc, pipe, bg_color", "pc, pipe, bg_color, d_xyz, d_scaling"),
+    ("pipe, background)", "pipe, background, d_xyz, d_scaling)"),
     ("means3D = pc.get_xyz", "means3D = pc.get_xyz + d_xyz"),
     ("opacities=pc.get_opacity", "opacities=pc.get_opacity, scales=pc.get_scaling + d_scaling"),
     ("gaussians = GaussianModel(3)", "gaussians = GaussianModel(3)\n    deform = DeformModel()"),
@@ -718,8 +722,39 @@ REFUSED = {
     ),
     "values changed by the script": (
         {},
-        [(STATEMENT, "gaussians._opacity.data.clamp_(0)")],
+        [("gaussians.oneupSHdegree()", "gaussians._opacity.data.clamp_(0)")],
         "changes _opacity outside",
+    ),
+    "a call of a function that fails": (
+        {},
+        [("view, gaussians, pipe, background)", "view, gaussians, pipe, background, depth=1)")],
+        "its call of render gives depth, which fails",
+    ),
+    "a call with too few values": (
+        {},
+        [("view, gaussians, pipe, background)", "view, gaussians, pipe)")],
+        "its call of render lacks bg_color, which fails",
+    ),
+    "a call of the model with too many values": (
+        {},
+        [("GaussianModel(3)", "GaussianModel(3, 4)")],
+        "its call of GaussianModel gives 2 values of 1, which fails",
+    ),
+    "an optimizer that rests": (
+        {},
+        [
+            (
+                "        gaussians.optimizer.step()",
+                "        if iteration < opt.warm_up:\n            gaussians.optimizer.step()",
+            )
+        ],
+        "its optimizer steps only where iteration < opt.warm_up",
+    ),
+    "another matrix": ({}, [("projmatrix=0", "projmatrix=view.intrinsics")], "is view.intrinsics"),
+    "a method that the model lacks": (
+        {},
+        [(STATEMENT, "gaussians.prune(mask)")],
+        "calls prune, which its model lacks (train.py:",
     ),
     "rows changed and read": (
         {},
@@ -766,6 +801,49 @@ def test_what_reading_cannot_follow_is_refused_by_name(tmp_path, what):
     given, changes, expected = REFUSED[what]
     repo = fork(tmp_path, *changes, **given)
     assert expected in "; ".join(errors(repo))
+
+
+CALLED = {
+    "tried": (STATEMENT, "try:\n                gaussians.prune(mask)\n            except E: ..."),
+    "where a checkpoint is given": (
+        "    if checkpoint:\n",
+        "    if checkpoint:\n        gaussians.prune(mask)\n",
+    ),
+    "an optimizer that rests at the end": (
+        "        gaussians.optimizer.step()",
+        "        if iteration < opt.iterations:\n            gaussians.optimizer.step()",
+    ),
+    "by an option that is off": (
+        STATEMENT,
+        "if opt.thin == 2 or opt.rate > 0:\n                gaussians.prune(mask)",
+    ),
+    "of a class that inherits": (STATEMENT, "gaussians.cuda()"),
+    "of another function of this name": (
+        "    for iteration in",
+        "    def l1_loss(a): ...\n    l1_loss(1, 2)\n    for iteration in",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", CALLED)
+def test_a_call_that_may_not_be_reached_or_not_fail_is_no_failure(tmp_path, what):
+    flags = (
+        "\ndef read_flags",
+        (
+            "\nparser.add_argument('--rate', default=0.0)\nparser.add_argument('--thin', default=1)"
+            "\n\ndef read_flags"
+        ),
+    )
+    inherits = ("class GaussianModel:", "class GaussianModel(nn.Module):")
+    changes = [inherits] if "inherits" in what else []
+    assert errors(fork(tmp_path, CALLED[what], flags, *changes)) == []
+
+
+def test_what_a_script_changes_until_densification_ends_ends_before_stage_2(tmp_path):
+    repo = fork(tmp_path, (STATEMENT, "gaussians._opacity.data.clamp_(0)"))
+    assert errors(repo) == []
+    (warned,) = (each.found for each in read_fork(repo).findings if each.code == "row-change")
+    assert "which changes _opacity, ends before stage 2" in warned
 
 
 @pytest.mark.parametrize("what", ["_xyz.grad[rows] = 0", "_xyz.requires_grad = False"])

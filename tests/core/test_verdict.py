@@ -96,6 +96,14 @@ REUSED = f"""    seen = pc.get_features
 {CALL}        colors_precomp=colours,
 """
 
+JOINED = """    colours = torch.clamp(pc.get_features, 0)
+    colours = torch.cat([colours, pc.net(depths)], dim=1)
+    colours = torch.cat([colours, depths], dim=1)
+    whole, radii = rasterizer(means3D=means3D, opacities=opacity, colors_precomp=colours)
+    image = whole[:3]
+    return {"render": image}
+"""
+
 ASKED = """    opacity = pc.get_opacity
     if getattr(pc, "hidden", None) is not None:
         opacity = opacity * pc.hidden
@@ -226,6 +234,8 @@ def test_the_nearest_host_is_of_this_family(fork):
         ('names.append("f_dc_{}".format(i))', "...", "lacks the columns f_dc"),
         (".repeat(1, 3)", ".repeat(1, 2)", "flat, with two scales"),
         (".repeat(1, 3)", "", "its Gaussians are round, with one scale"),
+        (".repeat(1, 3)", ".repeat(1, 1)", "its Gaussians are round, with one scale"),
+        ("means3D=means3D, ", "means3D + pc.net(view), ", "makes means3D from pc.net"),
         ("    def save_ply", GROWS, "flat, with two scales"),
         ("= self._opacity.detach()", "= self.get_opacity.detach()", "stores activated values"),
         ("scaling_activation = torch.exp", "scaling_activation = softplus", "is softplus"),
@@ -311,6 +321,7 @@ def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):
             "rotations=rotations\n    )\n    opacity = pc.net(image)\n",
         ),
         ("rotations=rotations\n    )\n", "rotations=rotations\n    )\n    image = image[:3]\n"),
+        ("means3D=means3D, opacities=opacity, shs=shs,", "means3D, None, opacity, shs,"),
         ("rotations=rotations\n    )\n", CLAMPED),
         (END, EXPOSED),
         ("    opacity = pc.get_opacity\n", ASKED),
@@ -318,6 +329,7 @@ def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):
         ("= torch.exp", "= jt.exp"),
         ("    image, radii, depth, used = ", "    counts, radii, image, used = "),
         (CALL, REUSED),
+        (CALL, JOINED + CALL),
         (
             "class GaussianModel:",
             f"class GaussianModel2D:{GROWS}(self): ...\n\n\nclass GaussianModel:",

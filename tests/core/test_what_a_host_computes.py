@@ -84,6 +84,10 @@ def test_gaussians_in_another_order_are_another_picture(tmp_path):
         ),
         ({"widened": "cov[0][0] += 0.1f;"}, "a low-pass filter of 0.1"),
         ({"widened": ""}, "no low-pass filter"),
+        (
+            {"widened": f"{WIDENED} float blur = r * r; return {{ cov[0][0] + blur }};"},
+            "Gaussians widened by blur",
+        ),
         ({"blend": f"{QUADRATIC} float alpha = c.w * exp(power);"}, "not capped at 0.99"),
         (
             {"blend": "float own = min(0.99f, x); float alpha; alpha = a * own + b; alpha = own;"},
@@ -238,6 +242,26 @@ def test_a_script_without_our_flags_is_refused(tmp_path, text, says):
     repo = skeleton(tmp_path)
     (tmp_path / "train.py").write_text(text)
     assert any("[flags]" in error and says in error for error in errors(repo))
+
+
+def test_a_drawing_function_of_a_host_returns_its_picture_as_render(tmp_path):
+    repo = skeleton(tmp_path)
+    render = tmp_path / "gaussian_renderer/__init__.py"
+    returns = '\n    return {{"{}": image, "radii": radii}}\n'.format
+    render.write_text(render.read_text().rstrip() + returns("render"))
+    assert not errors(repo)
+    render.write_text(render.read_text().replace('"render"', '"foreground"'))
+    assert "returns no render" in errors(HostRepo(tmp_path))[0]
+
+
+def test_a_function_beside_the_argument_groups_may_read_the_flags(tmp_path):
+    repo = skeleton(tmp_path)
+    repo = rewritten(repo, "train.py", "parser.parse_args(", "merged_args(parser, ")
+    assert any("no argparse" in error for error in errors(repo))
+    groups = tmp_path / "arguments/__init__.py"
+    reads = "def merged_args(parser, line):\n    return parser.parse_args(line)\n"
+    groups.write_text(groups.read_text() + reads)
+    assert not errors(HostRepo(tmp_path))
 
 
 def test_argument_groups_make_flags_of_their_attributes(tmp_path):

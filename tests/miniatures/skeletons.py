@@ -107,7 +107,7 @@ def skeleton(
             for function in functions
         ),
         "train.py": "from gaussian_renderer import render\n"
-        + ("SparseGaussianAdam\n" if state == "October 2024" else "")
+        + ("from a import SparseGaussianAdam\n" if state == "October 2024" else "")
         + FLAGS,
     }
     for name, text in files.items():
