@@ -95,10 +95,7 @@ def locate(
 
 
 def _above(repo: HostRepo) -> list[HostRepo]:
-    """The folder above, if scripts here import what lies in it, as Mini-Splatting's do.
-
-    Of any other nothing is read: it may hold all that its user has.
-    """
+    """The folder above, which may hold all that its user has, if scripts import what lies in it."""
     above = HostRepo(repo.root.parent)
     used = {name for each in repo.root.glob("*.py") for name in imported(repo.tree(each.stem))}
     return [above] if any(map(above.path, used)) else []

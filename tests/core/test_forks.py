@@ -685,6 +685,11 @@ REFUSED = {
         ],
         "makes opacities from pc.net",
     ),
+    "models at iterations of its own": (
+        {},
+        [("    scene = Scene(", "    opt.save_iterations = [7000]\n    scene = Scene(")],
+        "saves at [7000] alone",
+    ),
     "a copy of the model": (
         {},
         [
