@@ -122,8 +122,7 @@ _ELSEWHERE = re.compile(r"\w+(?:\.\w+)*\.(?:scene(?:\.\w+)*|gaussian_renderer)")
 
 def failing(repo: HostRepo, scripts: Collection[str]) -> list[str]:
     """Why scripts fail or pass all seams by: modules that are imported under other names, which are
-    others to Python; another framework; compiled training; models saved at iterations of their own
-    alone; calls that their functions do not take.
+    others to Python; another framework; compiled training; calls that their functions do not take.
     """
     found = [
         f"{path} imports {name}, which is no module of this folder"
@@ -143,10 +142,6 @@ def failing(repo: HostRepo, scripts: Collection[str]) -> list[str]:
             if any("torch.compile" in ast.unparse(each) for each in node.decorator_list)
             and any(getattr(each, "attr", "") == "backward" for each in nodes(node))
         ]
-        saved = [v for to, v in assigned(tree) if ast.unparse(to).endswith(".save_iterations")]
-        if tree and "save_iterations.append(" not in ast.unparse(tree):
-            fixed = [each for each in saved if isinstance(each, ast.List)]
-            found += [f"{script} saves at {ast.unparse(each)} alone" for each in fixed[:1]]
         found += _misfits(repo, module_of(script))[:1]
     return found
 

@@ -148,6 +148,7 @@ class Session(SessionState):
 
     def finish(self) -> Summary:
         """End learning, tell observers, and return the summary."""
+        self.held = None
         state = self.last_state
         stage = state.stage if state else None
         if stage is not None and stage.taken == stage.steps:
@@ -177,20 +178,19 @@ class Session(SessionState):
                 "Report this with the host's commit: the adapter misses how it draws.",
             )
 
-    def save_interrupted(self) -> Path | None:
-        """After Ctrl-C, let the host save its model, and write the sidecar beside it.
+    def save_learned(self, iteration: int = 0) -> Path | None:
+        """Save the model with the host's own function, and the sidecar beside it.
 
-        Returns:
-            The saved file, or None if there is nothing to save.
+        As that of an ``iteration``, or after Ctrl-C of the last step; None if nothing is to save.
         """
         model = self.last() if self.last else None
         if model is None or self.output is None or not isinstance(self.adapter, ScriptAdapter):
             return None
         state = self.models[model]
         learned = not state.store.neutral or (self.settings.goal.on_area and state.steps > 0)
-        if not learned:
+        if not (learned or iteration):
             return None
-        return self.adapter.save_model(model, self.output, self.start + state.steps)
+        return self.adapter.save_model(model, self.output, iteration or self.start + state.steps)
 
     def _enter(self, seam: Seam, function: Any, instance: Any, args: Any, kwargs: Any) -> Any:
         """Hand a call to the handler of its role."""

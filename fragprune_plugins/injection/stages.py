@@ -12,6 +12,7 @@ import gc
 import logging
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -182,13 +183,9 @@ class Stages:
             self._learn(total, arguments, start=first, settings=self.settings)
 
     def _apart(self, own: str = "") -> dict[str, str]:
-        """Save what learns in a folder of its own in the output folder, where it needs one.
+        """Save what learns in this folder in the output folder, a control always in one of its own.
 
-        Args:
-            own: the folder's name. A control always has one, so a learned result keeps its place.
-
-        Returns:
-            The flag for the host, by field of ``CommandLine``, if its command names another folder.
+        Gives the flag for the host, by field of ``CommandLine``, if its command names another.
         """
         own = own if self.options.settings.goal.presses else "control"
         if own and self.output is not None:
@@ -198,13 +195,17 @@ class Stages:
     def _learn(self, last: int, arguments: list[str], **options: Any) -> None:
         """Run the host's script with learning on; the result is its model of iteration ``last``."""
         started = time.time()
+
+        def ended(session: Session) -> None:
+            if not self._model(last, started) and (path := session.save_learned(last)):
+                log.warning("the host saved no model of its last iteration: saved %s", path)
+
         try:
-            self._execute(arguments, learn=True, **options)
+            self._execute(arguments, learn=True, ended=ended, **options)
         except HostFailed as error:
-            saved = self._model(last)
-            if saved is None or saved.stat().st_mtime < started:
+            if (path := self._model(last, started)) is None:
                 raise
-            remedy = f"{error.remedy} The learned model was saved: {saved}"
+            remedy = f"{error.remedy} The learned model was saved: {path}"
             raise HostFailed(error.where, error.found, error.expected, remedy) from error
         self.after = self._model(last)
 
@@ -238,9 +239,10 @@ class Stages:
         *,
         learn: bool,
         settings: Settings | None = None,
+        ended: Callable[[Session], None] = lambda _: None,
         **options: Any,
     ) -> None:
-        """Run the host's script with these arguments, in a session with these options."""
+        """Run the host's script in a session with these options; ``ended`` gets it at its end."""
         session = Session(
             self.adapter,
             self.repo,
@@ -268,8 +270,9 @@ class Stages:
             ):
                 try:
                     process.run_main(host.script, host.module)
+                    ended(session)
                 except KeyboardInterrupt as error:  # the session still writes sidecars
-                    saved = session.save_interrupted() if learn else None
+                    saved = session.save_learned() if learn else None
                     raise self._interrupted(error, saved) from error
             session.expect_drawn()
         finally:
@@ -385,7 +388,7 @@ class Stages:
         arguments = self.host.saving(self.scratch, total, **self._apart())
         self._learn(total, arguments, start=resumed, settings=settings, **options)
 
-    def _model(self, iteration: int) -> Path | None:
-        """The host's PLY of an iteration, or None if the host saved none."""
+    def _model(self, iteration: int, since: float = 0.0) -> Path | None:
+        """The host's PLY of an iteration, or None if the host saved none since this time."""
         path = self.adapter.model_file(self.output, iteration) if self.output else None
-        return path if path and path.exists() else None
+        return path if path and path.exists() and path.stat().st_mtime >= since else None

@@ -177,13 +177,8 @@ def holds(start: Path, ply: Path) -> bool:
 def part_of(start: Path, kept: Tensor, folder: Path) -> Path:
     """A copy of a file that the host can resume, with a part of its Gaussians.
 
-    Whatever has a row for each Gaussian keeps the rows of these: parameters, their moments,
-    statistics, and what else a fork counts.
-
-    Args:
-        start: a checkpoint, or a PLY.
-        kept: (N,) bool, over its N Gaussians.
-        folder: for the copy, which has the file's name.
+    Whatever has a row for each of its N Gaussians keeps those of ``kept``, (N,) bool: parameters,
+    their moments, statistics, and what else a fork counts. The copy has the file's name.
     """
     target = folder / start.name
     if start.suffix == ".ply":

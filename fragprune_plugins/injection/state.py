@@ -144,6 +144,7 @@ class SessionState:
         self.warned = False
         self.main: weakref.ReferenceType[Any] | None = None  # the scene's model, of several
         self.last: weakref.ReferenceType[Any] | None = None
+        self.held: Any = None  # the model after its last step, until somebody saw it saved
         self.last_state: ModelState | None = None  # stays when the host drops its model
         self.rendering: ContextVar[tuple[Any, int] | None] = ContextVar("rendering", default=None)
         self.pausing: ContextVar[bool] = ContextVar("paused", default=False)

@@ -203,6 +203,8 @@ def begin_step(session: SessionState, model: Any, state: ModelState) -> None:
         output = (session.origin or session.output) if resumed else None
         session.adapter.prepare_stage2(model, output)
         state.prepared = True
+    if state.steps >= session.from_step + session.settings.iterations:
+        session.held = model
     if state.stage is not None and state.steps > session.from_step:
         state.stage.begin(lambda: session.adapter.opacities(model))
 

@@ -279,7 +279,7 @@ def test_ctrl_c_leaves_a_ply_and_its_network(mini, tmp_path):
         model, camera = host.model(16), host.camera()
         for iteration in (1, 2):
             host.step(model, camera, iteration)
-        ply = host.save_interrupted()
+        ply = host.save_learned()
         assert sidecar.find(ply)
         assert same(network(ply), model._deformation.state_dict())
 

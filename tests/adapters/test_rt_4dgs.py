@@ -291,7 +291,7 @@ def test_ctrl_c_leaves_a_checkpoint(mini, tmp_path):
         model, camera = host.model(COUNT), host.camera()
         for iteration in (2, 3):
             host.step(model, camera, iteration)
-        capture, iteration = load(host.save_interrupted())
+        capture, iteration = load(host.save_learned())
         assert iteration == 2
         assert torch.equal(capture[11]["fragprune"]["logits"], host.store(model).logits)
 

@@ -17,10 +17,11 @@ import torch
 from cli.commands import run as command_line
 from finetune.several import ended
 from miniatures import runs
+from miniatures.hosts import HOSTS
 from miniatures.runs import OPTIONS, check_stage_two
 from miniatures.vanilla_3dgs import HOST, InterruptAt, run_script, running
 
-from fragprune_plugins import Portable, Schedule, Settings
+from fragprune_plugins import Control, Portable, Pressure, Schedule, Settings
 from fragprune_plugins.adapting import HostRepo, Interrupted, SessionError, UsageError, read_ply
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection.launch import RunOptions, run
@@ -208,6 +209,23 @@ def test_a_portable_run_moves_shapes_and_leaves_thresholds_neutral(photographs, 
     store, info = sidecar.load(summary.model_after)
     assert store.neutral
     assert info.settings["goal"] == "portable"
+
+
+@pytest.mark.parametrize("goal", [Pressure(), Control()], ids=["pruned", "control"])
+def test_a_model_is_saved_though_the_host_saves_none_of_its_last_iteration(
+    photographs, tmp_path, goal
+):
+    script = runs.written(HOSTS["vanilla-3dgs"], tmp_path / "host") / "train.py"
+    asked = "if iteration in saving_iterations"
+    text = script.read_text()
+    assert asked in text
+    script.write_text(text.replace(asked, f"{asked} and iteration <= 10"))
+    words = runs.command(script, photographs, tmp_path / "out", 10)
+    summary = run(words, replace(OPTIONS, settings=replace(OPTIONS.settings, goal=goal)))
+    assert summary.model_after is not None
+    store, _ = sidecar.load(summary.model_after)
+    assert len(store) == summary.gaussians == len(read_ply(summary.model_after).xyz)
+    assert store.neutral == (not goal.learns)
 
 
 @pytest.mark.usefixtures("ctrl_c")

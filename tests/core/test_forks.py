@@ -670,11 +670,6 @@ REFUSED = {
         [("\ndef read_flags", "\nfor scan in scans:\n    training(opt, 0)\n\ndef read_flags")],
         "several calls of training",
     ),
-    "no model at the iterations asked for": (
-        {},
-        [("in save_iterations", "% 100 == 0")],
-        "does not save where --save_iterations says",
-    ),
     "other Gaussians in a further draw": (
         {},
         [
@@ -684,11 +679,6 @@ REFUSED = {
             )
         ],
         "makes opacities from pc.net",
-    ),
-    "models at iterations of its own": (
-        {},
-        [("    scene = Scene(", "    opt.save_iterations = [7000]\n    scene = Scene(")],
-        "saves at [7000] alone",
     ),
     "a copy of the model": (
         {},

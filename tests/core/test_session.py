@@ -87,15 +87,15 @@ def test_what_was_learned_is_saved_at_the_iteration_that_the_host_reached(steppe
 
     monkeypatch.setattr(session.adapter, "save_model", save)
     monkeypatch.setattr(session, "output", None)
-    assert session.save_interrupted() is None
+    assert session.save_learned() is None
     monkeypatch.setattr(session, "output", Path("out"))
     monkeypatch.setattr(session, "start", 20)
-    assert session.save_interrupted() == Path("there")
+    assert session.save_learned() == Path("there")
     assert saved == [(model, Path("out"), 22)]
     monkeypatch.setattr(session, "last", None)
-    assert session.save_interrupted() is None
+    assert session.save_learned() is None
     monkeypatch.setattr(session, "last", lambda: None)  # the host dropped it
-    assert session.save_interrupted() is None
+    assert session.save_learned() is None
 
 
 @pytest.mark.parametrize(
@@ -120,7 +120,7 @@ def test_a_model_is_saved_only_if_something_was_learned(
         if not neutral:
             state.store.open(torch.full((30,), 0.5))
         monkeypatch.setattr(host.session.adapter, "save_model", lambda *_: Path("there"))
-        assert (host.session.save_interrupted() is not None) is saves
+        assert (host.session.save_learned() is not None) is saves
 
 
 @pytest.mark.parametrize("error", [OSError(), ModuleNotFoundError("no torchvision\nat all")])
