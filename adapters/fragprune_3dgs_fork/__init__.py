@@ -399,8 +399,9 @@ class ForkAdapter(GraphdecoAdapter):
         Raises:
             UsageError: these, or an option under which the host draws by another function.
         """
+        given = {word.partition("=")[0] for word in arguments}
         for name in read_fork(repo).options:
-            if f"--{name}" in arguments:
+            if f"--{name}" in given:
                 raise UsageError(
                     f"--{name}",
                     "a drawing function that was not read",

@@ -372,8 +372,9 @@ def test_a_drawing_function_for_an_option_that_is_off_is_not_reached(tmp_path, s
         return
     assert errors(repo) == []
     ForkAdapter().refuse(repo, ["--eval"], stage="auto", device="cuda")
-    with pytest.raises(UsageError, match="a drawing function that was not read"):
-        ForkAdapter().refuse(repo, ["--posed"], stage="auto", device="cuda")
+    for word in ("--posed", "--posed=1"):
+        with pytest.raises(UsageError, match="a drawing function that was not read"):
+            ForkAdapter().refuse(repo, [word], stage="auto", device="cuda")
 
 
 def test_of_several_scripts_those_are_served_that_can_be(tmp_path):
