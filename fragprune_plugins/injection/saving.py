@@ -123,7 +123,7 @@ def on_capture(session: SessionState, call: SeamCall) -> Any:
     """
     model = call.model
     check_learned(session, model)
-    result = call.run()
+    result, session.held = call.run(), None
     state = session.models.get(model)
     if state is not None and (session.standing_still(model) or state.store.cuts):
         session.expect_rows(model, state, str(call.seam))

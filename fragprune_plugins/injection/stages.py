@@ -197,7 +197,8 @@ class Stages:
         started = time.time()
 
         def ended(session: Session) -> None:
-            if not self._model(last, started) and (path := session.save_learned(last)):
+            unsaved = session.held is not None and not self._model(last, started)
+            if unsaved and (path := session.save_learned(last)):
                 log.warning("the host saved no model of its last iteration: saved %s", path)
 
         try:

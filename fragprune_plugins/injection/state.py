@@ -144,7 +144,7 @@ class SessionState:
         self.warned = False
         self.main: weakref.ReferenceType[Any] | None = None  # the scene's model, of several
         self.last: weakref.ReferenceType[Any] | None = None
-        self.held: Any = None  # the model after its last step, until somebody saw it saved
+        self.held: Any = None  # the model after its last step, until the host saved it
         self.last_state: ModelState | None = None  # stays when the host drops its model
         self.rendering: ContextVar[tuple[Any, int] | None] = ContextVar("rendering", default=None)
         self.pausing: ContextVar[bool] = ContextVar("paused", default=False)
@@ -242,11 +242,8 @@ class SessionState:
 
         None removes that of an earlier file of this name, which loading would refuse as stale.
         """
-        about: dict[str, Any] = {
-            "adapter": self.adapter.name,
-            "host_commit": self.repo.commit,
-            "settings": self.settings.as_dict(),
-        }
+        about: dict[str, Any] = {"adapter": self.adapter.name, "host_commit": self.repo.commit}
+        about["settings"], self.held = self.settings.as_dict(), None
         if whole is not None:
             sidecar.replace_pair(path, whole, store, **about)
         elif store is not None:
