@@ -273,7 +273,7 @@ def _size(repo: HostRepo, script: str) -> str:
         for call in (each for each in calls if getattr(each.func, "id", "") == name):
             passed = dict(zip(parameters, call.args, strict=False))
             passed |= {each.arg: each.value for each in call.keywords if each.arg}
-            for parameter in (passed.keys() & read) - cameras:
+            for parameter in sorted((passed.keys() & read) - cameras):
                 if not is_off(passed[parameter]):
                     return f"{parameter}={ast.unparse(passed[parameter])}"
     return ""

@@ -117,6 +117,7 @@ class Session(SessionState):
         return self._take_back()
 
     def _take_back(self) -> list[Finding]:
+        self.held = None
         for state in self.models.values():
             while state.hooks:
                 state.hooks.pop().remove()
@@ -148,7 +149,6 @@ class Session(SessionState):
 
     def finish(self) -> Summary:
         """End learning, tell observers, and return the summary."""
-        self.held = None
         state = self.last_state
         stage = state.stage if state else None
         if stage is not None and stage.taken == stage.steps:

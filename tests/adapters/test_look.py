@@ -24,6 +24,7 @@ ENDED = ("--densify_until_iter", 8)
 """Before the last iteration, as in every training that ends."""
 
 RESUMED = {
+    "2dgs": ("train.py",),
     "3dgs-fork": ("train_scene.py",),
     "light-gaussian": ("train_densify_prune.py", "--prune_iterations", 9),
     "lp-3dgs": ("train.py",),

@@ -2,7 +2,14 @@
 
 import pytest
 
-from fragprune_plugins.workbench.figures.wording import describe, fewer, gain, headlines, outcome
+from fragprune_plugins.workbench.figures.wording import (
+    begun,
+    describe,
+    fewer,
+    gain,
+    headlines,
+    outcome,
+)
 
 
 def measured(fragments, ms, psnr, error=0.01):
@@ -148,3 +155,8 @@ def test_a_table_says_in_words_what_a_ratio_means(before, after, change, frame):
     assert lines["frame, ms"].endswith(f" {frame}")
     assert lines["PSNR, dB"].endswith(" +0.50")
     assert text.endswith("Means over 7 views, ± a standard error; cpu engine on cpu")
+
+
+def test_a_record_of_before_there_were_trials_says_nothing_of_one():
+    before, after = {"gaussians": 9}, {"gaussians": 9}
+    assert begun({"settings": {}, "before": before, "after": after}) == []

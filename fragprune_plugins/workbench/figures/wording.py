@@ -232,10 +232,11 @@ def begun(data: Mapping[str, Any]) -> list[str]:
     """Lines on what came before the first step of a fine-tuning: its trial, and Gaussians removed.
 
     Args:
-        data: its figures, with "settings", "before", "after", "keep" and "forgotten".
+        data: its figures, with "settings", "before" and "after"; and "keep" and "forgotten", which
+            records may lack.
     """
-    lines, dropout, keep = [], data["settings"]["dropout"], data["keep"]
-    if data["forgotten"] is not None and dropout:
+    lines, dropout, keep = [], data["settings"].get("dropout"), data.get("keep")
+    if data.get("forgotten") is not None and dropout:
         lines.append(
             f"A trial made other photographs {data['forgotten']:.2f} dB worse, so the model knew "
             f"its photographs by heart, and learned with --dropout {dropout:g}."
