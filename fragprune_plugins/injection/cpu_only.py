@@ -1,7 +1,7 @@
 """Runs a host that hard-codes CUDA on a machine without a GPU (``--device cpu``).
 
-Inside a block, a torch function mode rewrites CUDA devices, and substitutes replace CUDA calls. It
-serves small scenes, debugging and CI.
+Inside a block, a torch function mode rewrites CUDA devices, and substitutes replace CUDA calls.
+Optimizers step in torch's fused kernel.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from unittest import mock
 
 import torch
 from torch.overrides import TorchFunctionMode
+
+from fragprune_plugins.learning.adam import stepping_fused
 
 _CUDA = re.compile(r"cuda(:\d+)?$")
 _NAMES = frozenset((str, torch.device))  # looked up by type: every torch call comes by
@@ -108,6 +110,7 @@ def cpu_only() -> Iterator[None]:
     with (
         mock.patch.multiple(torch.cuda, **_SUBSTITUTES),
         mock.patch.object(torch, "load", load_to_cpu),
+        stepping_fused(),
         _Redirect(),
     ):
         yield

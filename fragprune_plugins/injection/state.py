@@ -53,7 +53,7 @@ class ModelState:
         loaded: the means with which a sidecar's thresholds were loaded.
         stepped: value of ``steps`` at the last step of the store.
         pictured: what was drawn to learn from in this step: (``steps``, view, part).
-        lent: per running optimizer step, (param group, the host's options) to restore.
+        lent: per running optimizer step, (param group, the host's rate) to restore.
     """
 
     store: ThresholdStore
@@ -69,7 +69,7 @@ class ModelState:
     hooks: list[Any] = field(default_factory=list)
     stepped: int = -1
     pictured: set[tuple[int, int, int]] = field(default_factory=set)
-    lent: list[list[tuple[dict[str, Any], dict[str, Any]]]] = field(default_factory=list)
+    lent: list[list[tuple[dict[str, Any], Any]]] = field(default_factory=list)
 
     __repr__ = one_line
 

@@ -15,7 +15,6 @@ from torch import Tensor
 from fragprune_plugins.hosts.seams import SeamCall
 from fragprune_plugins.injection import ranks
 from fragprune_plugins.injection.state import ModelState, SessionState
-from fragprune_plugins.learning.adam import can_be_fused
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.learning.stage2 import Stage2
 from fragprune_plugins.learning.thresholds import ThresholdStore
@@ -119,14 +118,14 @@ def hook_optimizers(session: SessionState, model: Any, state: ModelState) -> Non
 def before_step(session: SessionState, reference: Any, optimizer: Any, *_: Any) -> None:
     """In stage 2, remove gradients of frozen parameters, so that no optimizer changes them.
 
-    Other parameters get the rates of stage 2, and on a CPU the fused kernel, for this step only,
-    because the host saves both in its checkpoints.
+    Other parameters get the rates of stage 2, for this step only, because the host saves them in
+    its checkpoints.
     """
     model = reference()
     state = session.models.get(model) if model is not None else None
     if state is None:
         return
-    lent: list[tuple[dict[str, Any], dict[str, Any]]] = []
+    lent: list[tuple[dict[str, Any], Any]] = []
     state.lent.append(lent)
     if not session.standing_still(model):
         expect_sound(session, model, state)
@@ -140,13 +139,9 @@ def before_step(session: SessionState, reference: Any, optimizer: Any, *_: Any) 
             for parameter in group["params"]:
                 parameter.grad = None
             continue
-        ours: dict[str, Any] = {}
         if stage is not None and name in rates and name not in scheduled:
-            ours["lr"] = stage.rate(name, rates[name])
-        if can_be_fused(optimizer, group):
-            ours["fused"] = True
-        lent.append((group, {option: group[option] for option in ours}))
-        group.update(ours)
+            lent.append((group, group["lr"]))
+            group["lr"] = stage.rate(name, rates[name])
     expect_sound(session, model, state)
 
 
@@ -164,7 +159,7 @@ def expect_sound(session: SessionState, model: Any, state: ModelState) -> None:
 
 
 def after_step(session: SessionState, reference: Any, *_: Any) -> None:
-    """Restore the host's options, and let the store step once per counted step.
+    """Restore the host's rates, and let the store step once per counted step.
 
     A host may step several optimizers in one counted step.
     """
@@ -172,8 +167,8 @@ def after_step(session: SessionState, reference: Any, *_: Any) -> None:
     state = session.models.get(model) if model is not None else None
     if state is None:
         return
-    for group, options in state.lent.pop() if state.lent else ():
-        group.update(options)
+    for group, rate in state.lent.pop() if state.lent else ():
+        group["lr"] = rate
     if state.stepped == state.steps:
         return
     state.stepped = state.steps

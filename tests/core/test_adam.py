@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from fragprune_plugins.learning.adam import can_be_fused, make_adam
+from fragprune_plugins.learning.adam import can_be_fused, make_adam, stepping_fused
 
 
 def group_of(kind=torch.optim.Adam, grad=None, **options):
@@ -64,3 +64,17 @@ def test_ours_is_fused_on_a_cpu_and_steps_without_gradients_too():
     assert adam.param_groups[0]["eps"] == 1e-15
     elsewhere = torch.ones(3, device="meta", requires_grad=True)
     assert not make_adam([{"params": [elsewhere], "lr": 0.1}]).param_groups[0]["fused"]
+
+
+def test_inside_every_plain_adam_is_fused_for_its_step_alone():
+    optimizer, group = group_of()
+    other, _ = group_of(torch.optim.AdamW)
+    seen = []
+    for each in (optimizer, other):
+        each.register_step_pre_hook(lambda each, *_: seen.append(each.param_groups[0]["fused"]))
+    with stepping_fused():
+        optimizer.step()
+        other.step()
+        assert not group["fused"]
+    optimizer.step()
+    assert seen == [True, None, None]
