@@ -66,8 +66,11 @@ def gradients(given: SpacetimeSplats, result: Sliced, outputs=OUTPUTS) -> dict[s
         )
         total = total + (value.double() * weights).sum()
     tensors = {k: v for k, v in vars(given).items() if torch.is_tensor(v) and v.requires_grad}
-    found = torch.autograd.grad(total, list(tensors.values()), materialize_grads=True)
-    return dict(zip(tensors, found, strict=True))
+    found = torch.autograd.grad(total, list(tensors.values()), allow_unused=True)
+    return {
+        name: torch.zeros_like(tensor) if grad is None else grad
+        for (name, tensor), grad in zip(tensors.items(), found, strict=True)
+    }
 
 
 def cut(engine, given: SpacetimeSplats, when: Moment) -> Sliced:

@@ -42,7 +42,8 @@ PLAIN = 0.25
 """gsplat's threshold of plain gradients over that of absolute ones, 0.0002 over 0.0008."""
 
 # torch's loader is safe by default since 2.6, and nerfstudio's schedulers save NumPy scalars
-torch.serialization.add_safe_globals(checkpoint_values())
+if hasattr(torch.serialization, "add_safe_globals"):
+    torch.serialization.add_safe_globals(checkpoint_values())
 
 
 @dataclass

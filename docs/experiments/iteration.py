@@ -25,7 +25,7 @@ import time
 from argparse import ArgumentParser
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -41,7 +41,6 @@ from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.engines.cpu import engine as cpu
 from fragprune_plugins.engines.cpu.memory import keep_freed_memory
 from fragprune_plugins.engines.losses import compiled_loss
-from fragprune_plugins.learning.adam import EPSILON
 from fragprune_plugins.learning.goals import Control, Pressure
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
@@ -190,11 +189,6 @@ def time_losses(size: str) -> dict[str, float]:
     return found
 
 
-def plain_adam(groups: list[dict[str, Any]]) -> torch.optim.Adam:
-    """As the hosts make it."""
-    return torch.optim.Adam(groups, eps=EPSILON)
-
-
 def sides(size: str) -> tuple[int, int]:
     """Width and height."""
     width, height = map(int, size.split("x"))
@@ -225,7 +219,7 @@ def main() -> None:
     sizes = args.size or ["320x240", "640x480", "1280x960"]
     torch.set_num_threads(1 if args.loss else args.threads)
     if args.plain:
-        loop.photometric_loss, loop.make_adam = losses.torch_loss, plain_adam
+        loop.photometric_loss, loop.stepping_fused = losses.torch_loss, nullcontext
     else:
         keep_freed_memory()
     columns: dict[str, dict[str, float]] = {}

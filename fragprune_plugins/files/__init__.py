@@ -1,1 +1,1 @@
-"""Files of models, thresholds and records. A file is written completely or not at all."""
+"""Files of models and thresholds. A file is written completely or not at all."""

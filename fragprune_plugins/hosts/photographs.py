@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from fragprune_plugins.constants import SIDE_MAX
 from fragprune_plugins.errors import InputError
@@ -71,13 +70,3 @@ class Photographs:
     resolution: Resolution = Resolution()
     white_background: bool = False
     images: str = "images"
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values, for records."""
-        return asdict(self) | {"folder": str(self.folder.resolve())}
-
-    @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> Photographs:
-        """Rebuild from ``as_dict``."""
-        size = Resolution(**values["resolution"])
-        return cls(Path(values["folder"]), size, values["white_background"], values["images"])

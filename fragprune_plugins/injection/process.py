@@ -24,6 +24,8 @@ from fragprune_plugins.hosts import preflight
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.cpu_only import cpu_only
 
+READ = "Read the host's own message above."
+
 _OURS = Path(__file__).parents[1]
 
 
@@ -50,12 +52,8 @@ def telling(script: Path, root: Path) -> Iterator[None]:
         elif isinstance(error, ModuleNotFoundError) and not HostRepo(root).path(lacking):
             expected = "what the host itself imports"
             remedy = f"Run: {preflight.install([preflight.Missing(lacking, where)])}"
-        raise HostFailed(
-            where,
-            f"{type(error).__name__}{f': {message}' if message else ''}",
-            expected,
-            remedy,
-        ) from error
+        found = f"{type(error).__name__}{f': {message}' if message else ''}"
+        raise HostFailed(where, found, expected, remedy) from error
 
 
 @contextlib.contextmanager
@@ -81,7 +79,7 @@ def host_process(
 def surroundings(device: str) -> Iterator[None]:
     """Inside, torch and Pillow do what hosts expect of them on this device."""
     with (
-        torch.serialization.safe_globals(checkpoint_values()),
+        knowing_numpy(),
         _host_pictures(),
         mock.patch.object(os, "execv", _refuse_to_start_again),
         cpu_only() if device == "cpu" else current_gpu(device),
@@ -110,12 +108,8 @@ def run_main(script: Path, module: str = "") -> None:
         if isinstance(error.__cause__, FragpruneError):
             raise error.__cause__ from None
         if error.code not in (None, 0):
-            raise HostFailed(
-                script.name,
-                f"ended with exit code {error.code}",
-                "0",
-                "Read the host's own message above.",
-            ) from error
+            found = f"ended with exit code {error.code}"
+            raise HostFailed(script.name, found, "0", READ) from error
 
 
 _ENVIRONMENT = {"site-packages", "dist-packages"}
@@ -164,6 +158,12 @@ def current_gpu(device: str) -> Iterator[None]:
         yield
 
 
+def knowing_numpy() -> contextlib.AbstractContextManager[None]:
+    """Inside, torch's safe loader takes NumPy's scalars; before torch 2.5 it cannot be told to."""
+    telling = getattr(torch.serialization, "safe_globals", None)
+    return telling(checkpoint_values()) if telling else contextlib.nullcontext()
+
+
 def checkpoint_values() -> list[Any]:
     """What torch's safe loader does not know of what hosts save: NumPy scalars."""
     scalar: Any = np.float64(0).__reduce__()[0]
@@ -172,12 +172,8 @@ def checkpoint_values() -> list[Any]:
 
 def _refuse_to_start_again(program: str, arguments: list[str]) -> NoReturn:
     """In place of ``os.execv``: a host that starts itself again would run without fragprune."""
-    raise HostFailed(
-        Path(sys.argv[0]).name,
-        "an attempt to start itself again, as some hosts do where their loss is NaN",
-        "a run that reaches its end",
-        "Read the host's own message above.",
-    )
+    found = "an attempt to start itself again, as some hosts do where their loss is NaN"
+    raise HostFailed(Path(sys.argv[0]).name, found, "a run that reaches its end", READ)
 
 
 @contextlib.contextmanager

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import sys
 from collections.abc import Callable, Iterator
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
-
-import torch
 
 from fragprune_plugins.errors import SessionError
 from fragprune_plugins.hosts.adapter import ScriptAdapter
@@ -88,9 +87,9 @@ class Session(SessionState):
             ranks.expect_one()
         packages = self.adapter.installed if self.repo.package else ()
         self._ledger = PatchLedger(self.repo.root, packages)
-        disable: Any = torch.compiler.disable  # a host may compile what calls a seam
-        # It imports dynamo, which takes a second, and which an optimizer imports anyway.
-        enter = disable(self._enter) if self.learn else self._enter
+        enter = self._enter
+        if self.learn:  # a host may compile what calls a seam; optimizers import dynamo anyway
+            enter = importlib.import_module("torch._dynamo").disable(enter)
         try:
             self.stand_ins.place()
             for seam in self.adapter.seams_for(self.repo):

@@ -129,12 +129,9 @@ class Stages:
             )
         gc.collect()  # the error held the host's frames, and so its socket and its model
         if (saved := end()) is None:  # some hosts refuse a command with exit code 0
-            raise HostFailed(
-                self.host.script.name,
-                f"ended without a checkpoint of iteration {total}",
-                "a training that runs to its end",
-                "Read the host's own message above.",
-            )
+            found = f"ended without a checkpoint of iteration {total}"
+            expected = "a training that runs to its end"
+            raise HostFailed(self.host.script.name, found, expected, process.READ)
         return Start(total, saved, "the end of stage 1")
 
     def one_run(self) -> None:

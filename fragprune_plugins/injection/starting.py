@@ -25,7 +25,7 @@ from fragprune_plugins.hosts.adapter import (
     optimizer_state,
 )
 from fragprune_plugins.injection.command import HostCommand
-from fragprune_plugins.injection.process import checkpoint_values
+from fragprune_plugins.injection.process import knowing_numpy
 
 log = logging.getLogger("fragprune")
 
@@ -36,6 +36,8 @@ _DOOR = Door(
     "The file is cut off, or is no checkpoint. Remove it, or name another file.",
 )
 
+_SAFELY: dict[str, Any] = {"weights_only": True, "mmap": True}
+_IS_SAFE = hasattr(torch.serialization, "safe_globals")  # since torch 2.5
 
 FINISHED = "stage1.fragprune-finished"
 """The mark of a finished stage 1 in the host's output folder, until stage 2 is finished too."""
@@ -236,7 +238,7 @@ def _read_checkpoint(path: Path) -> tuple[Any, int]:
     """Read (capture, iteration) of a checkpoint; tensors are mapped from the file."""
     if not path.exists():
         raise UsageError(str(path), "no such file", "a checkpoint", "Check the path.")
-    with _DOOR.reading(path), torch.serialization.safe_globals(checkpoint_values()):
-        # The safe loader: whatever the file holds, nothing of it is run.
-        capture, iteration = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    with _DOOR.reading(path), knowing_numpy():
+        # Safely, nothing in it is run; an old torch loads it as the host itself does next.
+        capture, iteration = torch.load(path, "cpu", **(_SAFELY if _IS_SAFE else {}))
         return capture, int(iteration)

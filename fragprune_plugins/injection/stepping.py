@@ -138,8 +138,7 @@ def before_step(session: SessionState, reference: Any, optimizer: Any, *_: Any) 
         if trained is not None and name not in trained:
             for parameter in group["params"]:
                 parameter.grad = None
-            continue
-        if stage is not None and name in rates and name not in scheduled:
+        elif stage is not None and name in rates and name not in scheduled:
             lent.append((group, group["lr"]))
             group["lr"] = stage.rate(name, rates[name])
     expect_sound(session, model, state)

@@ -17,11 +17,7 @@ from torch.optim import optimizer as steps
 EPSILON = 1e-15
 """As the hosts have it: a larger one freezes thresholds whose gradients are tiny."""
 
-
-def make_adam(groups: list[dict[str, Any]]) -> torch.optim.Adam:
-    """An Adam of parameters on one device; they are contiguous, as the kernel wants them."""
-    devices = {each.device.type for group in groups for each in group["params"]}
-    return torch.optim.Adam(groups, eps=EPSILON, fused=True if devices == {"cpu"} else None)
+_FUSES = torch.__version__ >= "2.4"  # on a CPU, as versions are compared
 
 
 @contextlib.contextmanager
@@ -30,36 +26,31 @@ def stepping_fused() -> Iterator[None]:
 
     The option is lent for one step, because hosts save the groups in their checkpoints.
     """
-    lent: list[list[tuple[dict[str, Any], Any]]] = []
+    lent: list[list[dict[str, Any]]] = []
 
     def lend(optimizer: Any, *_: Any) -> None:
-        groups = [each for each in optimizer.param_groups if can_be_fused(optimizer, each)]
-        lent.append([(group, group["fused"]) for group in groups])
-        for group in groups:
+        lent.append([each for each in optimizer.param_groups if can_be_fused(optimizer, each)])
+        for group in lent[-1]:
             group["fused"] = True
 
     def take_back(*_: Any) -> None:
-        for group, value in lent.pop():
-            group["fused"] = value
+        for group in lent.pop():
+            group["fused"] = None
 
-    before = steps.register_optimizer_step_pre_hook(lend)
-    after = steps.register_optimizer_step_post_hook(take_back)
-    try:
+    before, after = steps.register_optimizer_step_pre_hook, steps.register_optimizer_step_post_hook
+    with before(lend), after(take_back):
         yield
-    finally:
-        before.remove()
-        after.remove()
 
 
 def can_be_fused(optimizer: Any, group: dict[str, Any]) -> bool:
     """Whether an optimizer may step a param group in the fused kernel.
 
-    It may if it is torch's own plain Adam, and all that the kernel reads lies in memory as float32
-    on the CPU, in one order.
+    It may if it is torch's own plain Adam that leaves this open, and all that the kernel reads
+    lies in memory as float32 on the CPU, in one order.
     """
-    if type(optimizer) is not torch.optim.Adam:
+    if type(optimizer) is not torch.optim.Adam or not _FUSES:
         return False
-    if group["fused"] or group["capturable"] or group["differentiable"]:
+    if group["fused"] is not None or group["capturable"] or group["differentiable"]:
         return False
     tensors = []
     for parameter in group["params"]:

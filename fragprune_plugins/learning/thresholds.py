@@ -14,7 +14,7 @@ from torch import Tensor
 
 from fragprune_plugins.constants import ALPHA_MIN, LOGIT_MAX, LOGIT_MIN, NEUTRAL_LOGIT
 from fragprune_plugins.errors import AlignmentError, InputError, SidecarError
-from fragprune_plugins.learning.adam import make_adam
+from fragprune_plugins.learning.adam import EPSILON
 from fragprune_plugins.types import Rim, is_rim, is_stop, short
 
 _START_MARGIN = 1e-4  # thresholds start this far (relative) below the 1/255 skip: nothing changes
@@ -52,7 +52,7 @@ class ThresholdStore:
 
     def _bind(self, logits: Tensor, lr: float) -> None:
         self.logits = logits.detach().clone().requires_grad_(True)
-        self.optimizer = make_adam([{"params": [self.logits], "lr": lr}])
+        self.optimizer = torch.optim.Adam([self.logits], lr=lr, eps=EPSILON)
         # known of the logits: whether all are neutral, and whether none is; thresholds as given
         self._seen: _Noted[tuple[bool, bool]] | None = None
         self._given: _Noted[Tensor] | None = None

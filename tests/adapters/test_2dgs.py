@@ -11,9 +11,10 @@ from fragprune_2dgs import SurfelSplatting
 from fragprune_plugins import Portable, Settings
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import InputError, UsageError
-from fragprune_plugins.files import records, sidecar
+from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection import process
 from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.run.work import photographs_of
 
 COUNT = 16

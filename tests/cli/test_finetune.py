@@ -10,9 +10,10 @@ from cli.commands import fails, run, run_error, run_json
 from finetune import tiny
 
 import fragprune_plugins as fp
-from fragprune_plugins.files import records, sidecar
+from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.learning.pressure import LEAST_PRESSURE
+from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.finetune import loop
 from fragprune_plugins.workbench.finetune.finished import advise, describe_untruncated
 from fragprune_plugins.workbench.goals import parse_goal

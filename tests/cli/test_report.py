@@ -11,7 +11,7 @@ import torch
 from cli.commands import run, run_error, run_json
 from finetune import tiny
 
-from fragprune_plugins.files import records
+from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.report import page as report_page
 from fragprune_plugins.workbench.scenes.generated import around, bounds

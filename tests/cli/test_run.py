@@ -13,10 +13,10 @@ from miniatures.vanilla_3dgs import HOST
 
 from fragprune_plugins import load
 from fragprune_plugins.adapting import HostRepo, ModelFileError, UsageError
-from fragprune_plugins.files import records
 from fragprune_plugins.injection import launch
 from fragprune_plugins.learning.schedule import USUAL_STOP
 from fragprune_plugins.testing import mutations
+from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.finetune import trial
 from fragprune_plugins.workbench.run import work
 

@@ -9,7 +9,7 @@ import pytest
 from cli.commands import fails, run_json
 from finetune import tiny
 
-from fragprune_plugins.files import records
+from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.models.formats.ply import write_ply
 from fragprune_plugins.workbench.view import site as serving
 

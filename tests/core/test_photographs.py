@@ -10,6 +10,8 @@ from miniatures.skeletons import skeleton
 from fragprune_graphdeco.adapter import resolution
 from fragprune_plugins.adapting import HostRepo, NotComparedError, Photographs, Resolution
 from fragprune_plugins.workbench.demo import work
+from fragprune_plugins.workbench.figures import records
+from fragprune_plugins.workbench.figures.recorded import Recorded, recorded
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 HOST = HostRepo(Path(work.__file__).with_name("host"))
@@ -95,5 +97,7 @@ def test_a_command_that_holds_nothing_out_is_refused():
     [Resolution(), Resolution(4), Resolution(width=7), Resolution(width=9, shrink_only=True)],
 )
 def test_photographs_survive_a_record(size, tmp_path):
-    read = Photographs(tmp_path, size, True, "images_2")
-    assert Photographs.from_dict(read.as_dict()) == read
+    said = Recorded(Photographs(tmp_path, size, True, "images_2"), (tmp_path / "a.ply",))
+    path = records.leave(tmp_path / "a.ply", "run", {"photographs": said.as_dict()})
+    (record,) = records.find(path.parent)
+    assert recorded(record) == said

@@ -20,7 +20,7 @@ from fragprune_plugins.constants import VERSION
 from fragprune_plugins.errors import RecordError
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.reading import MEBIBYTE, Door
-from fragprune_plugins.files.records import strict
+from fragprune_plugins.workbench.figures.records import strict
 from fragprune_plugins.workbench.models.model import writable_folder
 
 RESULTS = (".md", ".csv", ".png")

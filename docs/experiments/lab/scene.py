@@ -10,11 +10,12 @@ from typing import Any
 import torch
 
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.files import records
 from fragprune_plugins.files.atomic import digest
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.workbench.bench.timing import describe_machine
+from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.figures.evaluate import Candidate
+from fragprune_plugins.workbench.figures.recorded import plain
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.scenes.dataset import Dataset
 
@@ -54,7 +55,7 @@ def load_columns(
 
 def describe_photographs(photographs: Photographs, dataset: Dataset) -> dict[str, Any]:
     """What photographs are, as plain values, wherever they lie."""
-    return photographs.as_dict() | {
+    return plain(photographs) | {
         "folder": photographs.folder.resolve().name,
         "sha256": _digest(dataset),
         "training_views": len(dataset.train),

@@ -191,7 +191,8 @@ class Arena:
 
     def tensor(self, name: str, count: int, dtype: torch.dtype) -> Tensor:
         """An array as a tensor."""
-        return self.memory[self._at[name] :][: count * dtype.itemsize].view(dtype)
+        size = torch.empty((), dtype=dtype).element_size()
+        return self.memory[self._at[name] :][: count * size].view(dtype)
 
 
 def blocks_of(count: int, per_block: int = THREADS) -> int:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from fragprune_plugins.files.atomic import replacing
-from fragprune_plugins.files.records import strict
 from fragprune_plugins.learning.stage2 import evenly
 from fragprune_plugins.workbench.audit import page
 from fragprune_plugins.workbench.audit.audit import audit as measured
@@ -16,6 +15,7 @@ from fragprune_plugins.workbench.audit.placing import Placed, Side, place
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import cameras_of, open_engine
 from fragprune_plugins.workbench.commands.options import EngineOptions
+from fragprune_plugins.workbench.figures.records import strict
 from fragprune_plugins.workbench.figures.wording import nothing_drawn
 from fragprune_plugins.workbench.models.model import load, writable_folder
 from fragprune_plugins.workbench.scenes.cameras import divided, load_cameras, load_scene_cameras

@@ -22,9 +22,9 @@ from fragprune_plugins.errors import (
     UsageError,
     printable,
 )
-from fragprune_plugins.files.records import strict
 from fragprune_plugins.learning.interruption import EXIT_CODE, Terminate
 from fragprune_plugins.workbench.commands.rules import Rules
+from fragprune_plugins.workbench.figures.records import strict
 from fragprune_plugins.workbench.ranks import launched, speaks
 
 JSON = "fragprune.json"

@@ -28,7 +28,7 @@ from fragprune_plugins.workbench.commands.rules import Alone, apart
 from fragprune_plugins.workbench.goals import AtMost, Faster
 
 
-class _Stop(click.ParamType[float | str | None]):
+class _Stop(click.ParamType):  # type: ignore[type-arg] # generic in later releases alone
     """Type of an option for a stop: a share of light, auto, or off, which is None."""
 
     name = "share"

@@ -12,11 +12,11 @@ import torch
 
 from fragprune_plugins.engines import Engine, device_for
 from fragprune_plugins.errors import UsageError, printable
-from fragprune_plugins.files import records
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.plugins.hooks import engine_for
 from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
+from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.figures.wording import ITSELF
 from fragprune_plugins.workbench.ranks import launched, local_rank
 from fragprune_plugins.workbench.scenes.cameras import divided, load_cameras, load_scene_cameras

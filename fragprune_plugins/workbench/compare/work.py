@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.files import records
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.types import View
 from fragprune_plugins.workbench.commands.command import Report
@@ -18,10 +17,10 @@ from fragprune_plugins.workbench.commands.opening import (
     own_cameras,
 )
 from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
-from fragprune_plugins.workbench.figures import wording
+from fragprune_plugins.workbench.figures import records, wording
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
 from fragprune_plugins.workbench.figures.pictures import leave_panels
-from fragprune_plugins.workbench.figures.recorded import Recorded, recorded
+from fragprune_plugins.workbench.figures.recorded import Recorded, plain, recorded
 from fragprune_plugins.workbench.models.model import load, writable_folder
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
 from fragprune_plugins.workbench.scenes.output import over_white, trained_on
@@ -87,7 +86,7 @@ def _figures(
         "engine": after["engine"],
         "device": before["device"],
         "enlarge": enlarge,
-        "scene": photographs.as_dict() if photographs else None,
+        "scene": plain(photographs) if photographs else None,
         "warnings": wording.nothing_drawn(drawn) + wording.strangers(before, after),
     }
 

@@ -14,7 +14,6 @@ from typing import Any
 
 import click
 
-from fragprune_plugins.files import records
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.injection.launch import RunOptions, RunSummary, run
@@ -26,6 +25,7 @@ from fragprune_plugins.workbench.commands.opening import open_engine
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.demo.folder import claiming, clear
 from fragprune_plugins.workbench.demo.scene import POINTS, VIEWS, WIDTH, make_scene
+from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.figures.evaluate import (
     Candidate,
     enlarged,

@@ -17,9 +17,9 @@ from matplotlib.colors import to_hex
 from torch import Tensor
 
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.files import records
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.learning.stage2 import evenly
+from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.scenes.dataset import Shot
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from fragprune_plugins.files.records import DOOR, Record, located
-from fragprune_plugins.hosts.photographs import Photographs
+from fragprune_plugins.hosts.photographs import Photographs, Resolution
+from fragprune_plugins.workbench.figures.records import DOOR, Record, located
 
 _NUMBERS = {"scale_modifier", "dilation", "near", "alpha_max"}
 """Fields of ``RasterInputs`` that a record may set to a number."""
@@ -31,11 +31,16 @@ class Recorded:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, for ``recorded``."""
-        return self.photographs.as_dict() | {
+        return plain(self.photographs) | {
             "models": [str(model.resolve()) for model in self.models],
             "filtered": self.filtered,
             "drawing": dict(self.drawing),
         }
+
+
+def plain(photographs: Photographs) -> dict[str, Any]:
+    """Plain values, for records."""
+    return asdict(photographs) | {"folder": str(photographs.folder.resolve())}
 
 
 def recorded(record: Record) -> Recorded | None:
@@ -59,5 +64,6 @@ def recorded(record: Record) -> Recorded | None:
             if not (number if name in _NUMBERS else name == "compensation"):
                 raise ValueError(f"{name} is {value!r}")
         filtered = bool(values["filtered"])
-        scene = values | {"folder": located(values["folder"], folder)}
-        return Recorded(Photographs.from_dict(scene), models, filtered, drawing)
+        scene, size = located(values["folder"], folder), Resolution(**values["resolution"])
+        photographs = Photographs(scene, size, values["white_background"], values["images"])
+        return Recorded(photographs, models, filtered, drawing)

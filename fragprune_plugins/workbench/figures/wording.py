@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from fragprune_plugins.files.reading import lies_in
-from fragprune_plugins.files.records import CONTROL
 from fragprune_plugins.learning.goals import Fewer
+from fragprune_plugins.workbench.figures.records import CONTROL
 from fragprune_plugins.workbench.goals import Faster, parse_goal
 
 _EQUAL = 0.005  # a ratio of fragments that reads 1.00

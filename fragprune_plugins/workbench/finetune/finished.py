@@ -9,13 +9,12 @@ from typing import Any
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import RecordError
-from fragprune_plugins.files import records
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.learning.interruption import EXIT_CODE
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
-from fragprune_plugins.workbench.figures import wording
+from fragprune_plugins.workbench.figures import records, wording
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
 from fragprune_plugins.workbench.figures.recorded import Recorded
 from fragprune_plugins.workbench.finetune.loop import FinetuneResult

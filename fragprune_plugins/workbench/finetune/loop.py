@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.learning.adam import make_adam
+from fragprune_plugins.learning.adam import EPSILON, stepping_fused
 from fragprune_plugins.learning.area import area_per_pixel
 from fragprune_plugins.learning.events import Progress, StepStats
 from fragprune_plugins.learning.schedule import Schedule, Settings
@@ -137,9 +137,8 @@ class Training:
         }
         self.model = replace(start, **leaves, thresholds=None)
         self.rates = {name: rate * settings.rate for name, rate in rates.items()}
-        self.optimizer = make_adam(
-            [{"params": [each], "lr": self.rates[name]} for name, each in leaves.items()]
-        )
+        groups = [{"params": [each], "lr": self.rates[name]} for name, each in leaves.items()]
+        self.optimizer = torch.optim.Adam(groups, eps=EPSILON)
         self._plain_first = False  # a view of this step is drawn for the first time somewhere
         if self.stage.target is not None:
             self.stage.target.attach(self)
@@ -166,7 +165,7 @@ class Training:
         bar = tqdm(
             desc="fine-tuning", total=total, initial=self.done, leave=None, disable=not progress
         )
-        with bar, between_steps() as waiting:
+        with bar, stepping_fused(), between_steps() as waiting:
             for shots in islice(steps, self.done, None):
                 self.between = False
                 self._step(shots, waiting, keeper)

@@ -14,18 +14,17 @@ import torch
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import DatasetError, ModelFileError, RecordError, SidecarError
-from fragprune_plugins.files import records
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.reading import MEBIBYTE, Door, lies_in
-from fragprune_plugins.files.records import CONTROL, DOOR, Record
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import OwnCameras, open_engine, own_cameras
 from fragprune_plugins.workbench.commands.options import EngineOptions
-from fragprune_plugins.workbench.figures import wording
+from fragprune_plugins.workbench.figures import records, wording
 from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.figures.page import Table, embedded
 from fragprune_plugins.workbench.figures.recorded import recorded
+from fragprune_plugins.workbench.figures.records import CONTROL, DOOR, Record
 from fragprune_plugins.workbench.goals import parse_goal
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.report import page as report_page

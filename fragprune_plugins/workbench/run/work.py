@@ -18,7 +18,6 @@ from torch import Tensor
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import FragpruneError
-from fragprune_plugins.files import records
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.injection import launch
 from fragprune_plugins.injection.process import current_gpu
@@ -28,7 +27,7 @@ from fragprune_plugins.workbench.commands.command import JSON, Report
 from fragprune_plugins.workbench.commands.logs import Bar, logging_steps
 from fragprune_plugins.workbench.commands.opening import bound_threads, open_engine
 from fragprune_plugins.workbench.commands.options import EngineOptions
-from fragprune_plugins.workbench.figures import wording
+from fragprune_plugins.workbench.figures import records, wording
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
 from fragprune_plugins.workbench.figures.recorded import Recorded
 from fragprune_plugins.workbench.finetune.trial import Trial, tried

@@ -14,11 +14,12 @@ from miniatures.vanilla_3dgs import HOST
 
 from fragprune_plugins.adapting import HostRepo, RasterInputs, UsageError, View
 from fragprune_plugins.engines import create_engine
-from fragprune_plugins.files import records, sidecar
+from fragprune_plugins.files import sidecar
 from fragprune_plugins.hosts.adapter import ConfigFile, read_config
 from fragprune_plugins.hosts.preflight import missing_imports
 from fragprune_plugins.injection.starting import resumed_at
 from fragprune_plugins.workbench import finetune
+from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.figures.recorded import recorded
 from fragprune_plugins.workbench.finetune import checkpoints
 from fragprune_plugins.workbench.models import model as models

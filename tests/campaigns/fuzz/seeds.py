@@ -19,8 +19,9 @@ from finetune import tiny
 from PIL import Image
 from plyfile import PlyData
 
-from fragprune_plugins.files import records, sidecar
+from fragprune_plugins.files import sidecar
 from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.finetune import checkpoints
 from fragprune_plugins.workbench.models import formats
 from fragprune_plugins.workbench.models.formats.ply import write_ply
