@@ -173,6 +173,19 @@ def test_a_gpu_that_is_another_process_s_could_not_be_tried(monkeypatch, capsys)
     assert printed.err.strip().endswith("busy or unavailable")
 
 
+@pytest.mark.parametrize(
+    ("cuda", "extra"),
+    [
+        ("11.8", "fragprune-plugins[cuda12] and nvidia-cuda-nvrtc-cu12,"),
+        ("12.8", "fragprune-plugins[cuda12],"),
+        ("13.0", "fragprune-plugins[cuda13],"),
+    ],
+)
+def test_the_extra_of_torchs_own_cuda_is_named(monkeypatch, cuda: str, extra: str) -> None:
+    monkeypatch.setattr(torch.version, "cuda", cuda)
+    assert extra in driver.remedy()
+
+
 # ---- what auto does then -----------------------------------------------------------------------
 
 

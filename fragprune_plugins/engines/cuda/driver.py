@@ -36,10 +36,9 @@ def remedy() -> str:
     cuda = torch.version.cuda
     if cuda is None:
         return "Install torch for CUDA."
-    return (
-        f"Install fragprune-plugins[cuda{cuda.split('.')[0]}], for torch is for CUDA {cuda}; "
-        "see fragprune doctor."
-    )
+    old = cuda.startswith("11.")  # brings no NVRTC that we can use
+    extra = "[cuda12] and nvidia-cuda-nvrtc-cu12" if old else f"[cuda{cuda.split('.')[0]}]"
+    return f"Install fragprune-plugins{extra}, for torch is for CUDA {cuda}; see fragprune doctor."
 
 
 def version() -> str:
