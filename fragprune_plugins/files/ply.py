@@ -160,7 +160,7 @@ def _splat(path: Path, columns: Columns, filtered: bool) -> Model:
             for first in range(0, count if wanted else 0, _BLOCK):
                 rows = slice(first, first + _BLOCK)
                 several = [columns[name][rows] for name in wanted]
-                np.stack(several, axis=1, out=data[rows], casting="unsafe")
+                np.stack(several, axis=1, out=data[rows])
         _require_finite(path, wanted, data)
         return torch.from_numpy(data)
 

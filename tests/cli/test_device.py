@@ -20,6 +20,8 @@ from fragprune_plugins.workbench.figures.recorded import Recorded
 from fragprune_plugins.workbench.models.formats.ply import write_ply
 from fragprune_plugins.workbench.run.work import measure_models
 
+pytestmark = pytest.mark.skipif(torch.__version__ < "2.5", reason="no such device can be made")
+
 
 @pytest.fixture
 def engine(monkeypatch, plug):

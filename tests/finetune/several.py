@@ -91,6 +91,7 @@ def launch(size: int, work: Callable[[int], Any]) -> list[Ended]:
                         "MASTER_ADDR": "localhost",
                         "MASTER_PORT": port,
                         "TORCHELASTIC_USE_AGENT_STORE": "True",
+                        "TORCHELASTIC_RESTART_COUNT": "0",
                     }
                     torch.save(work(rank), Path(folder) / str(rank))
 

@@ -13,6 +13,7 @@ import weakref
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from miniatures.runs import OPTIONS, command, edit, written
 from patching.traces import Snapshot, warm_up
@@ -148,6 +149,7 @@ LEAKS = [
 ]
 
 
+@pytest.mark.skipif(torch.__version__ < "2.5", reason="torch keeps fewer kinds")
 def test_every_kind_of_planted_trace_is_found(tmp_path):
     differences = fresh(planted, tmp_path)
     missed = [leak for leak in LEAKS if not any(leak in each for each in differences)]

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 from finetune import several
 from miniatures.runs import OPTIONS, command, edit, written
 
@@ -93,6 +94,9 @@ def test_workers_load_the_hosts_views_and_draw_with_thresholds_or_are_refused(
             assert "Start workers by fork" in picture
 
 
+@pytest.mark.skipif(
+    torch.__version__ < "2.4" and sys.version_info >= (3, 11), reason="torch compiles nothing here"
+)
 def test_a_compiled_render_function_learns_the_same_bits(photographs, tmp_path):
     results = []
     for name in ("plain", "compiled"):

@@ -108,7 +108,7 @@ def settings() -> dict[str, Any]:
         "functions at exit": atexit._ncallbacks(),
         "threads": sorted(each.name for each in threading.enumerate()),
         "dtype": torch.get_default_dtype(),
-        "device": torch.get_default_device(),
+        "device": torch.empty(0).device,
         "function modes": list(torch.overrides._get_current_function_mode_stack()),
         "gradients": (torch.is_grad_enabled(), torch.is_inference_mode_enabled()),
         "anomalies": torch.is_anomaly_enabled(),
@@ -120,7 +120,7 @@ def settings() -> dict[str, Any]:
             torch.backends.cudnn.benchmark,
             torch.get_float32_matmul_precision(),
         ),
-        "safe globals": set(torch.serialization.get_safe_globals()),
+        "safe globals": set(getattr(torch.serialization, "get_safe_globals", list)()),
     }
 
 

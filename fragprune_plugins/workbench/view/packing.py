@@ -232,9 +232,14 @@ def _scales(shares: Words, extent: float) -> Words:
     return rounded
 
 
+def _singles(halves: Words) -> NDArray[np.float32]:
+    """In float32, to which only NumPy 2 brings half floats by itself."""
+    return halves.view(np.float16).astype(np.float32)
+
+
 def _colours(halves: Words) -> Words:
     """To 8 bits."""
-    levels = np.floor(halves.view(np.float16) * np.float32(0.15 * 255) + 128).clip(0, 255)
+    levels = np.floor(_singles(halves) * np.float32(0.15 * 255) + 128).clip(0, 255)
     rounded: Words = ((levels / 255 - 0.5) / 0.15).astype(np.float16).view(np.uint16)
     return rounded
 
@@ -242,6 +247,6 @@ def _colours(halves: Words) -> Words:
 def _harmonics(halves: Words) -> Words:
     """To 5 bits of degree 1, and to 4 bits."""
     step = np.where(np.arange(halves.shape[1]) < 9, 8, 16)
-    levels = np.floor(np.rint(halves.view(np.float16) * np.float32(128)) / step + 0.5) * step
+    levels = np.floor(np.rint(_singles(halves) * np.float32(128)) / step + 0.5) * step
     rounded: Words = (levels.clip(-128, 127) / 128 + 0).astype(np.float16).view(np.uint16)
     return rounded
