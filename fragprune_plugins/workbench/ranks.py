@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
 Each = TypeVar("Each")
 
+OLDEST = "2.5"
+"""Release of torch with which several processes were tried."""
+
 PATIENCE = 600.0
 """Seconds to wait for the other processes before this one ends with an error."""
 
@@ -144,7 +147,7 @@ def joined(device: torch.device) -> Iterator[Ranks]:
     """Inside, the processes that were launched together can exchange tensors of a device.
 
     Raises:
-        RanksError: they do not find each other.
+        RanksError: they do not find each other, or torch is too old.
     """
     ranks = launched()
     if not ranks.several:
@@ -152,6 +155,10 @@ def joined(device: torch.device) -> Iterator[Ranks]:
         return
     import torch
     import torch.distributed as dist
+
+    if torch.__version__ < OLDEST:  # 2.0 waits without end when the processes part
+        remedy = f"Learn in one process, or with torch {OLDEST}."
+        raise RanksError("learning", f"torch {torch.__version__}", f"{OLDEST} or newer", remedy)
 
     # Its functions have the group as a default, of the time of their import: imported later, as by
     # an optimizer, they would keep the group and its threads alive until Python is gone, and a

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 from cli.commands import run as run_command
 
@@ -21,6 +22,7 @@ from fragprune_plugins import Control, Fewer, Portable, Settings, joined
 from fragprune_plugins.errors import FragpruneError
 from fragprune_plugins.learning.stage2 import Stage2
 from fragprune_plugins.workbench.finetune import loop
+from fragprune_plugins.workbench.ranks import OLDEST
 
 LONGEST = 60  # seconds that a child may live
 STEPS = 12
@@ -76,6 +78,8 @@ def _keep_store(pipe: int) -> None:
 
 def launch(size: int, work: Callable[[int], Any]) -> list[Ended]:
     """Call ``work(rank)`` in each of so many processes; what it returns is what that one left."""
+    if torch.__version__ < OLDEST:
+        pytest.skip(f"several processes need torch {OLDEST}")
     read, write = os.pipe()
     agent = _forked(lambda: _keep_store(write))
     try:

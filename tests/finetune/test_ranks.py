@@ -15,11 +15,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fragprune_plugins import Control, Faster, Pressure, Schedule, Settings, finetune
-from fragprune_plugins.errors import UsageError
+from fragprune_plugins.errors import RanksError, UsageError
 from fragprune_plugins.workbench import ranks as module
 from fragprune_plugins.workbench.finetune import loop, processes
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
-from fragprune_plugins.workbench.ranks import Ranks, fingerprint, launched, speaks
+from fragprune_plugins.workbench.ranks import Ranks, fingerprint, joined, launched, speaks
 
 ALL = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
 
@@ -225,6 +225,13 @@ with joined(torch.device("cpu")) as ranks:
 with open(f"{sys.argv[1]}/{ranks.rank}", "w") as file:
     file.write(str(len(os.listdir("/proc/self/task"))))
 """
+
+
+def test_an_old_torch_is_refused_before_it_can_wait_without_end(monkeypatch):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setattr(torch, "__version__", "2.4.1")
+    with pytest.raises(RanksError, match="torch 2.4.1; expected 2.5"), joined(torch.device("cpu")):
+        pass
 
 
 def test_no_thread_of_the_group_outlives_it(tmp_path):
