@@ -230,7 +230,10 @@ with open(f"{sys.argv[1]}/{ranks.rank}", "w") as file:
 def test_an_old_torch_is_refused_before_it_can_wait_without_end(monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "2")
     monkeypatch.setattr(torch, "__version__", "2.4.1")
-    with pytest.raises(RanksError, match="torch 2.4.1; expected 2.5"), joined(torch.device("cpu")):
+    with (
+        pytest.raises(RanksError, match=r"torch 2\.4\.1; expected 2\.5"),
+        joined(torch.device("cpu")),
+    ):
         pass
 
 

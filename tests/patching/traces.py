@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image
+from PIL import Image, ImageMode
 
 Place = tuple[str, str]
 """Name of a module, and of an attribute or of a member of a class that the module defines."""
@@ -42,6 +42,7 @@ def warm_up() -> None:
     from tqdm import tqdm
 
     Image.init()
+    ImageMode.getmode("L")
     weight = torch.ones(3, requires_grad=True)
     optimizer = torch.optim.Adam([weight])
     for _ in tqdm(range(1), file=io.StringIO()):
