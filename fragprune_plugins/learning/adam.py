@@ -17,7 +17,7 @@ from torch.optim import optimizer as steps
 EPSILON = 1e-15
 """As the hosts have it: a larger one freezes thresholds whose gradients are tiny."""
 
-_FUSES = torch.__version__ >= "2.4"  # on a CPU, as versions are compared
+_FUSES = torch.__version__ >= "2.4"  # torch has it for a CPU since then
 
 
 @contextlib.contextmanager
