@@ -85,7 +85,7 @@ def main() -> None:
     engine, say = create_engine("cpu"), sys.stdout.write
     size, white = Resolution(args.resolution), over_white(args.first)
     dataset = load_photographs(Photographs(args.data, size, white))
-    first, models = load(args.first), {path.stem: load(path) for path in args.models}
+    first, models = load(args.first), {str(path): load(path) for path in args.models}
     beside = elsewhere(dataset.train)
     shown = [picture(engine, first, view)[0] for view in beside]
     say("| model | training, dB | held out, dB | SSIM | fragments | elsewhere, dB | worst |\n")
