@@ -66,7 +66,7 @@ def tracing(call: SeamCall) -> Iterator[RowTrace]:
     rows = len(model["means"])
     numbers = torch.arange(rows, dtype=torch.float64, device=model["means"].device)
     model[ROWS] = torch.nn.Parameter(numbers, requires_grad=False)
-    optimizers[ROWS] = torch.optim.SGD([model[ROWS]])
+    optimizers[ROWS] = torch.optim.SGD([model[ROWS]], lr=0.0)
     try:
         yield trace
     finally:

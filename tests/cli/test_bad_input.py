@@ -3,6 +3,7 @@
 import json
 
 import pytest
+import torch
 from cli.commands import fails, run, run_error
 from finetune import tiny
 
@@ -211,3 +212,18 @@ def test_a_name_that_no_file_can_have_is_no_model(scene, tmp_path, command):
     more += ["--iters", 1] if command == "finetune" else []
     asked = (command, *names, *more, "--out", tmp_path / "new.ply")
     fails(*asked, says="cannot be opened (File name too long)", code=1)
+
+
+def test_a_numpy_that_torch_cannot_use_is_named_before_anything_is_read(tmp_path, monkeypatch):
+    """As torch before 2.3 beside NumPy 2."""
+
+    def numpy(tensor):
+        raise RuntimeError("Numpy is not available")
+
+    monkeypatch.setattr(torch.Tensor, "numpy", numpy)
+    (tmp_path / "a.ply").write_text("not read")
+    for words in (("audit", tmp_path / "a.ply", "--out", tmp_path / "out"), ("doctor",)):
+        ended = run(*words)
+        assert ended.exit_code == 1
+        assert "for which it was not compiled; expected NumPy 1" in ended.output
+        assert 'Run: pip install "numpy<2"' in ended.output

@@ -13,7 +13,7 @@ import pytest
 import torch
 from cli.commands import fails, run_json
 from cli.commands import finetune_words as words
-from finetune.several import at_step, command
+from finetune.several import at_step, command, needs_processes
 
 from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.files.ply import read_ply
@@ -160,6 +160,7 @@ def test_one_process_has_nobody_to_share_gaussians_with(scene, tmp_path):
     fails(*words(scene, tmp_path / "out.ply", "--shard-gaussians"), says="torchrun")
 
 
+@needs_processes
 def test_no_launcher_no_rendezvous(scene, tmp_path, monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "2")
     for name in ("RANK", "MASTER_ADDR", "MASTER_PORT"):

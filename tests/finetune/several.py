@@ -76,6 +76,11 @@ def _keep_store(pipe: int) -> None:
     signal.pause()
 
 
+needs_processes = pytest.mark.skipif(
+    torch.__version__ < OLDEST, reason=f"several processes need torch {OLDEST}"
+)
+
+
 def launch(size: int, work: Callable[[int], Any]) -> list[Ended]:
     """Call ``work(rank)`` in each of so many processes; what it returns is what that one left."""
     if torch.__version__ < OLDEST:

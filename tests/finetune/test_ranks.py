@@ -10,7 +10,7 @@ from dataclasses import replace
 import pytest
 import torch
 from finetune import test_shards, tiny
-from finetune.several import CASES, STEPS, launch, learn, lose_nan
+from finetune.several import CASES, STEPS, launch, learn, lose_nan, needs_processes
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -237,6 +237,7 @@ def test_an_old_torch_is_refused_before_it_can_wait_without_end(monkeypatch):
         pass
 
 
+@needs_processes
 def test_no_thread_of_the_group_outlives_it(tmp_path):
     """One that freed a tensor while Python ended aborted the process: to torchrun, a failure.
 

@@ -6,6 +6,7 @@ import contextlib
 import difflib
 import json
 import os
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import import_module
@@ -14,6 +15,7 @@ from typing import Any
 import click
 
 from fragprune_plugins.errors import (
+    EngineError,
     FragpruneError,
     Interrupted,
     MemoryLimitError,
@@ -117,7 +119,25 @@ def work_of(package: str, **options: Any) -> Report:
     work: Callable[..., Report] = getattr(
         import_module(f"{package}.work"), package.rpartition(".")[2]
     )
+    expect_numpy()
     return work(**options)
+
+
+def expect_numpy() -> None:
+    """Refuse a NumPy that torch cannot use: torch before 2.3 was compiled for NumPy 1.
+
+    Raises:
+        EngineError: what is wrong, and what to install.
+    """
+    torch, numpy = sys.modules.get("torch"), sys.modules.get("numpy")
+    if torch is None or numpy is None:
+        return
+    try:
+        torch.empty(0).numpy()
+    except RuntimeError as error:
+        found = f"NumPy {numpy.__version__}, for which it was not compiled"
+        remedy = 'Run: pip install "numpy<2"'
+        raise EngineError(f"torch {torch.__version__}", found, "NumPy 1", remedy) from error
 
 
 class Group(click.Group):

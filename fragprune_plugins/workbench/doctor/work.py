@@ -14,7 +14,7 @@ from fragprune_plugins.engines.cuda import driver, kernels, self_check
 from fragprune_plugins.engines.cuda.frame import MACROS, blend_macros, unblend_macros
 from fragprune_plugins.errors import EngineError, UsageError
 from fragprune_plugins.plugins.loading import load_plugins
-from fragprune_plugins.workbench.commands.command import Report
+from fragprune_plugins.workbench.commands.command import Report, expect_numpy
 
 _PACKAGES = ("fragprune-plugins", "torch", "numpy", "pluggy", "wrapt", "plyfile", "scikit-image")
 
@@ -66,6 +66,11 @@ def examine() -> Report:
             "The cpu engine is missing, so the slow reference engine draws on the CPU. "
             "Install a C++17 compiler and install fragprune-plugins again."
         )
+    try:
+        expect_numpy()
+    except EngineError as error:
+        wrong = True
+        lines.append(str(error))
     if verdict is not None and verdict.outcome != "agrees":
         wrong = True
         lines.append(f"{verdict}. Until then, --engine auto does not use it. {verdict.remedy}")
