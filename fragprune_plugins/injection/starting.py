@@ -37,7 +37,8 @@ _DOOR = Door(
 )
 
 _SAFELY: dict[str, Any] = {"weights_only": True, "mmap": True}
-_IS_SAFE = hasattr(torch.serialization, "safe_globals")  # since torch 2.5
+if not hasattr(torch.serialization, "safe_globals"):  # torch before 2.5
+    _SAFELY = {"weights_only": False}
 
 FINISHED = "stage1.fragprune-finished"
 """The mark of a finished stage 1 in the host's output folder, until stage 2 is finished too."""
@@ -240,5 +241,5 @@ def _read_checkpoint(path: Path) -> tuple[Any, int]:
         raise UsageError(str(path), "no such file", "a checkpoint", "Check the path.")
     with _DOOR.reading(path), knowing_numpy():
         # Safely, nothing in it is run; an old torch loads it as the host itself does next.
-        capture, iteration = torch.load(path, "cpu", **(_SAFELY if _IS_SAFE else {}))
+        capture, iteration = torch.load(path, "cpu", **_SAFELY)
         return capture, int(iteration)
