@@ -240,6 +240,6 @@ def _read_checkpoint(path: Path) -> tuple[Any, int]:
     if not path.exists():
         raise UsageError(str(path), "no such file", "a checkpoint", "Check the path.")
     with _DOOR.reading(path), knowing_numpy():
-        # Safely, nothing in it is run; an old torch loads it as the host itself does next.
+        # Safely, nothing in it is run; an old torch loads it as the hosts do.
         capture, iteration = torch.load(path, "cpu", **_SAFELY)
         return capture, int(iteration)

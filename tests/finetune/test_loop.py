@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from finetune import tiny
+from torch.optim.optimizer import register_optimizer_step_post_hook
 
 from fragprune_plugins import Control, Faster, Fewer, Pressure, ThresholdStore, finetune
 from fragprune_plugins.adapting import RasterInputs
@@ -35,6 +36,19 @@ def test_what_is_not_named_stays_to_the_bit(model, dataset, train, moving):
         moved = not torch.equal(getattr(result.model, name), before[name])
         assert moved == (name in moving), name
         assert not getattr(result.model, name).requires_grad
+
+
+@pytest.mark.skipif(torch.__version__ < "2.4", reason="torch fuses no Adam on a CPU")
+def test_every_optimizer_steps_in_the_fused_kernel(model, dataset):
+    seen = []
+
+    def note(optimizer, *_):
+        seen.extend(group["fused"] for group in optimizer.param_groups)
+
+    with register_optimizer_step_post_hook(note):
+        finetune(model, dataset, Settings(iterations=2, goal=Pressure(1e-3)))
+    assert len(seen) == 2 * (len(ALL) + 1)  # and the thresholds'
+    assert all(seen)
 
 
 def mean_fragments(model, shots, engine):
