@@ -390,8 +390,11 @@ def test_a_stage_two_that_fails_after_it_saved_names_the_model(host, tmp_path):
 if args.start_checkpoint:
     (out / "{ply}").parent.mkdir(parents=True)
     (out / "{ply}").touch()
+    tick = time.time() - 0.05  # a file has the time of the kernel's last tick, or an earlier one
+    os.utime(out / "{ply}", (tick, tick))
     raise KeyError("ours_30000")
 """
+    saves = f"import os, time\n{saves}"
     with pytest.raises(HostFailed, match="ours_30000") as caught:
         run([host(STAGES + saves), "-m", str(tmp_path / "out")], AUTO)
     assert f"learned model was saved: {tmp_path / 'out' / ply}" in caught.value.remedy
