@@ -22,7 +22,6 @@ from fragprune_3dgs_fork.fork import (
     CLASS,
     HANDED,
     MODEL,
-    POSES,
     RENDERER,
     Fork,
     plain_distances,
@@ -30,7 +29,7 @@ from fragprune_3dgs_fork.fork import (
     read_getters,
     rests_after_densification,
 )
-from fragprune_3dgs_fork.rasterizer import Output
+from fragprune_3dgs_fork.rasterizer import POSES, Output
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, kernels, plain, reading
 from fragprune_plugins.adapting import (
     CommandLine,
@@ -107,6 +106,26 @@ class Unproved(Unread):
 IN_PLACE: dict[str, type[Unread]] = {"unread": Unread, "unproved": Unproved}
 
 
+def plane_depth(channels: Tensor, settings: Any) -> Tensor:
+    """(1, H, W) depth at which each pixel's ray meets its plane, 0 where nothing is drawn.
+
+    There, the gradient of PGSR's kernel is infinite. No fragment of its own reads it, but
+    fragments just beyond a threshold would.
+
+    Args:
+        channels: (5 or more, H, W), normal in view space, whatever comes fourth, distance.
+        settings: of the rasterizer, with the field of view.
+    """
+    import torch
+
+    (height, width), like = channels.shape[1:], channels.device
+    x = (torch.arange(width, device=like) - width / 2) * (2 * settings.tanfovx / width)
+    y = (torch.arange(height, device=like) - height / 2) * (2 * settings.tanfovy / height)
+    facing = channels[0] * x + channels[1] * y[:, None] + channels[2] + 1e-8
+    drawn = (channels != 0).any(0)
+    return torch.where(drawn, channels[4] / -torch.where(drawn, facing, 1.0), 0.0)[None]
+
+
 @dataclass(frozen=True)
 class ForkDialect(GraphdecoDialect):
     """The calls of a fork, with the values back that its source names."""
@@ -162,13 +181,16 @@ class ForkDialect(GraphdecoDialect):
         import torch
 
         depth, package = super().features(call), call.entry.split(":")[0]
-        if "objects" not in self.values(call):
+        objects = call.get(self.fork.blended.get(package, ""))
+        asked = all(getattr(call.settings, each, True) for each in self.fork.asking)
+        if "objects" not in self.values(call) or objects is None or not asked:
             return depth, None
-        objects = call[self.fork.blended[package]].flatten(1)
+        objects = objects.flatten(1)
         if self._detached(call):
             return depth, objects
         channels = objects if depth is None else torch.cat([depth, objects], dim=1)
-        return channels[:, :CHANNELS], channels[:, CHANNELS:]
+        others = channels[:, CHANNELS:]
+        return channels[:, :CHANNELS], others if others.shape[1] else None
 
     def _detached(self, call: HostCall) -> bool:
         return any(each.detached and each.role == "objects" for each in self._outputs(call))
@@ -214,19 +236,20 @@ class ForkDialect(GraphdecoDialect):
         return tuple(each.role for each in self._outputs(call))
 
     def made(self, outputs: RasterOutputs, call: HostCall) -> dict[str, Any]:
-        """Depth and objects have gradients."""
-        made, blended = super().made(outputs, call), outputs.features
+        """Depth, objects and the depth of a plane have gradients."""
+        made, blended, values = super().made(outputs, call), outputs.features, self.values(call)
         if blended is not None:
-            deep = int("depth" in self.values(call))
-            made |= {"depth": blended[:1], "objects": blended[deep:]}
+            made |= {"depth": blended[:1], "objects": blended[int("depth" in values) :]}
+            if "plane" in values:
+                made["plane"] = plane_depth(made["objects"], call.settings)
         return made
 
     def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Any, ...]:
         """The host's values in its order, with the shape and the type of its sums."""
 
         def packed(value: Output, made: Any) -> Any:
-            if value.role in IN_PLACE:
-                return IN_PLACE[value.role](value.name)
+            if value.role in IN_PLACE or made is None:  # or it was not asked for
+                return IN_PLACE.get(value.role, Unread)(value.name)
             if value.role not in ("count", "weight"):
                 return made.detach() if value.detached and value.role != "objects" else made
             made = made[:, None] if value.column else made
@@ -321,7 +344,11 @@ class ForkAdapter(GraphdecoAdapter):
         return (
             Seam(Role.SCENE, "scene", "Scene.__init__"),
             *(of(Role.ATTACH, name, graphdeco.optimizers) for name in setups),
-            *(of(Role.STEP, name) for name in ("update_learning_rate",) if fork.defines(name)),
+            *(
+                of(Role.STEP, name, graphdeco.no_noise if fork.noisy else None)
+                for name in ("update_learning_rate",)
+                if fork.defines(name)
+            ),
             of(Role.KEEP, "_prune_optimizer"),
             of(Role.APPEND, "cat_tensors_to_optimizer"),
             *(

@@ -10,11 +10,20 @@ from functools import cached_property, lru_cache
 from weakref import WeakKeyDictionary
 
 import fragprune_graphdeco as graphdeco
-from fragprune_3dgs_fork.rasterizer import Output, blended_argument, changed_gradients, meaning
+from fragprune_3dgs_fork.rasterizer import (
+    POSES,
+    SCREEN,
+    SERVED,
+    Output,
+    blended_argument,
+    changed_gradients,
+    meaning,
+    only_asks,
+)
 from fragprune_graphdeco import assigned, every, kernels, plain, reading
 from fragprune_plugins.adapting import Finding, Function, HostRepo, is_off, nodes, off_by_default
 
-MODEL, CLASS, RENDERER = "scene.gaussian_model", "GaussianModel", "gaussian_renderer"
+MODEL, CLASS, RENDERER = reading.MODEL, "GaussianModel", "gaussian_renderer"
 PARAMETERS = {"_xyz", "_features_dc", "_features_rest", "_opacity", "_scaling", "_rotation"}
 PRIMITIVES = {"_prune_optimizer", "cat_tensors_to_optimizer", "replace_tensor_to_optimizer"}
 """Methods that change rows or values of parameters inside the optimizer."""
@@ -41,13 +50,6 @@ _MODEL_ARGUMENTS = ("pc", "gaussians", "gaussian", "model")
 
 NEUTRAL = {"antialiasing", "confidence", "projmatrix_raw"}
 """Further settings that the engines know, or that are checked to be neutral at every call."""
-POSES = {"theta", "rho"}
-"""Arguments that only get a camera's gradients: how it turns and moves, 0 at every call."""
-SERVED = {"dc", *POSES}
-"""Further arguments that the engines know."""
-_SCREEN = re.compile(r"means2D_\w+")
-"""Further tensors that get a gradient on the screen, by which Gaussians are densified."""
-
 HANDED = ("detach", "clone", "contiguous", "squeeze", "unsqueeze")
 """Methods of a value that nobody reads yet: it is handed on in another shape."""
 _PROVABLE = re.compile(r"^(?!.*(median|max|normal|var|dist)).*(depth|alpha|acc|opac)")
@@ -87,9 +89,11 @@ class Fork:
         options: off by default, under which scripts draw by other functions.
         off: settings and arguments of the rasterizer that are None or False by default.
         scaled: settings that change the gradient on the screen alone, in its backward pass.
+        asking: settings without which a rasterizer leaves out the channels beside the colours.
         one_run: why a script cannot resume its own training; "" if all of them can.
         screens: arguments besides means2D that get a gradient on the screen.
         colours: options, off by default, under which a network makes the colours.
+        noisy: whether scripts move positions by noise, as large as their rate.
     """
 
     repo: HostRepo
@@ -105,9 +109,11 @@ class Fork:
     options: frozenset[str] = frozenset()
     off: frozenset[str] = frozenset()
     scaled: frozenset[str] = frozenset()
+    asking: frozenset[str] = frozenset()
     one_run: str = ""
     screens: frozenset[str] = frozenset()
     colours: frozenset[str] = frozenset()
+    noisy: bool = False
 
     def warn(self, code: str, where: str, found: str) -> None:
         """Add a warning, once for all places."""
@@ -157,6 +163,23 @@ class Fork:
         """The scripts and the checkout's own modules that they import, without model and draws."""
         seen = reading.reached(self.repo, map(reading.module_of, self.scripts), RENDERER)
         return {each: tree for each, tree in seen.items() if not _OF_MODELS.search(each)}
+
+    @cached_property
+    def early(self) -> set[ast.AST]:
+        """What scripts do only while they densify, with the functions that they need only then."""
+        trees = self.trees.values()
+        early = {node for script in self.scripts for node in _while_densifying(self.tree(script))}
+        made = [each for tree in trees for each in every(tree, ast.FunctionDef)]
+        named: dict[str, list[ast.AST]] = {each.name: [] for each in made}
+        for node in (node for tree in trees for node in every(tree, ast.Name, ast.Attribute)):
+            named.get(getattr(node, "id", getattr(node, "attr", "")), []).append(node)
+        while more := [
+            each
+            for each in made
+            if each not in early and named[each.name] and early.issuperset(named[each.name])
+        ]:
+            early |= {node for each in more for node in nodes(each)}
+        return early
 
 
 _known: WeakKeyDictionary[HostRepo, Fork] = WeakKeyDictionary()
@@ -453,14 +476,12 @@ def _read_methods(fork: Fork) -> None:
     for module, tree in fork.trees.items():
         owners = reading.owners(tree)
         statements = {each.value for each in nodes(tree) if isinstance(each, ast.Expr)}
-        trains = module in map(reading.module_of, fork.scripts)
-        early = _while_densifying(tree) if trains else set[ast.AST]()
         for node, name in _method_calls(tree):
             if name in changing:
                 still |= {name}
                 owner = ast.unparse(node.func.value)  # type: ignore[attr-defined]
                 own = _MODELS.search(owner) or owner.split("[")[0] in owners
-                if own and node in early - statements:
+                if own and node in fork.early and node not in statements:
                     fork.answering |= {name}
                 elif own and node not in statements:
                     at = fork.repo.at(module, node.lineno)
@@ -524,9 +545,13 @@ def _assigned(body: ast.AST, owner: str = "") -> Iterator[tuple[int, str]]:
 def _read_changes(fork: Fork) -> None:
     """A script that changes parameters itself cannot be held still in stage 2."""
     for module, tree in fork.trees.items():
-        early = {getattr(each, "lineno", 0) for each in _while_densifying(tree)}
+        early = {getattr(each, "lineno", 0) for each in nodes(tree) if each in fork.early}
+        noisy = _noisy(tree)
+        fork.noisy |= bool(noisy)
         for line, name in _assigned(tree):
             at = fork.repo.at(module, line)
+            if line in noisy:
+                continue
             if line in early:
                 fork.warn("row-change", at, f"that {at}, which changes {name}, ends before stage 2")
             else:
@@ -551,6 +576,36 @@ def _read_changes(fork: Fork) -> None:
             fork.warn("optimizer", at, f"stage 2 does not freeze what {name} of {script} trains")
             if f"{name}.load_state_dict(" not in ast.unparse(trained):
                 fork.one_run = fork.one_run or f"{script} does not resume what {name} trains"
+
+
+def _noisy(tree: ast.AST) -> set[int]:
+    """Lines that add a product with the rate of positions to them, as MCMC adds its noise."""
+    made: dict[str, list[ast.expr]] = {}
+    for to, value in assigned(tree):
+        made.setdefault(ast.unparse(to), []).append(value)
+    rates = [
+        to for to, (value, *_) in made.items() if ".update_learning_rate(" in ast.unparse(value)
+    ]
+
+    def product(value: ast.expr) -> bool:
+        """Whether a rate is a factor."""
+        return ast.unparse(value) in rates or (
+            isinstance(value, ast.BinOp)
+            and isinstance(value.op, ast.Mult)
+            and (product(value.left) or product(value.right))
+        )
+
+    def scaled(name: str) -> bool:
+        """Whether products are all that goes by a name; it may be turned by a matrix then."""
+        values = made.get(name, [])
+        fresh = [each for each in values if name not in _mentioned(each)]
+        return bool(fresh) and all(map(product, fresh))
+
+    return {
+        node.lineno
+        for node, name in _method_calls(tree)
+        if name == "add_" and len(node.args) == 1 and scaled(getattr(node.args[0], "id", ""))
+    }
 
 
 def read_getters(fork: Fork) -> list[Finding]:
@@ -612,7 +667,10 @@ def _read_draws(fork: Fork) -> None:
             _check_call(fork, at, name, call)
             blended = call.given.get(fork.blended.get(call.package, ""))
             made = source.values.get(getattr(blended, "id", ""), [])
-            if any(re.search(r"torch\.(zeros|empty)\(", ast.unparse(each)) for each in made):
+            filled = {getattr(each.value, "id", "") for each in every(body, ast.Subscript)}
+            if getattr(blended, "id", "") not in filled and any(
+                re.search(r"torch\.(zeros|empty)\(", ast.unparse(each)) for each in made
+            ):
                 found = f"{ast.unparse(blended or ast.Pass())}, which is empty unless asked for"
                 fork.refuse("rasterizer-call", at, found, "channels of every Gaussian")
         for node in nodes(body) if name in called else ():
@@ -656,7 +714,7 @@ def _check_call(fork: Fork, at: str, function: str, call: graphdeco.CallInSource
         fork.refuse("rasterizer-call", at, found, "the cameras of 3DGS")
     if POSES & call.arguments:
         fork.warn("rasterizer-call", at, "the cameras, which stand still in stage 2")
-    screens = frozenset(filter(_SCREEN.fullmatch, call.arguments))
+    screens = frozenset(filter(SCREEN.fullmatch, call.arguments))
     fork.screens |= screens
     given = call.arguments - SERVED - screens - {blended}
     further = [*(call.besides - NEUTRAL), *given]
@@ -664,7 +722,10 @@ def _check_call(fork: Fork, at: str, function: str, call: graphdeco.CallInSource
     fork.off |= {*further} - unknown
     for name in sorted(unknown & call.besides):
         changed = changed_gradients(fork.repo, call.package, name)
-        if changed is not None and changed <= {"means2D"}:
+        if only_asks(fork.repo, call.package, name):
+            unknown.remove(name)
+            fork.asking |= {name}
+        elif changed is not None and changed <= {"means2D"}:
             unknown.remove(name)
             fork.scaled |= {name}
             fork.warn("rasterizer-call", at, f"the gradient on the screen, which {name} changes")
@@ -725,25 +786,28 @@ def _output(fork: Fork, draw: Draw, call: graphdeco.CallInSource, number: int) -
     if "radii" in name:
         return Output(name, "radii")
     output = meaning(fork.repo, call, name)
-    uses = _uses(fork, draw, name) if output.role in ("unread", "unproved") else []
+    uses = _uses(fork, draw, name) if output.role in ("unread", "unproved") else {}
     read = output.role == "unread" and kernels.normal_sources(fork.repo, package)
+    at = fork.repo.at(RENDERER, call.line)
     if uses and _PROVABLE.search(name) and not read:
-        at = fork.repo.at(RENDERER, call.line)
         fork.warn("rasterizer-output", at, f"what {package} returns as {name}")
         return Output(name, "unproved")
-    if uses:
-        at = f"{RENDERER}:{draw.function} ({fork.repo.at(RENDERER, call.line)})"
-        found = f"{name}, read in {uses[0]}, whose meaning is unknown"
+    if uses and fork.early.issuperset(uses):
+        fork.warn("rasterizer-output", at, f"{name}, by which it densifies")
+    elif uses:
+        places = [place for node, place in uses.items() if node not in fork.early]
+        found = f"{name}, read in {places[0]}, whose meaning is unknown"
         expected = "picture, radii, and sums along the ray whose kernel was read"
+        at = f"{RENDERER}:{draw.function} ({at})"
         fork.refuse("rasterizer-output", at, found, expected)
     return output if output.role != "unproved" else Output(name, "unread")
 
 
-def _uses(fork: Fork, draw: Draw, name: str) -> list[str]:
-    """Places that read an output: in its function, or by its key where scripts draw."""
+def _uses(fork: Fork, draw: Draw, name: str) -> dict[ast.AST, str]:
+    """What reads an output, and where: in its function, or by its key where scripts draw."""
     body = fork.repo.function(RENDERER, draw.function)
     if body is None or name in ("", "_"):
-        return []
+        return {}
     keys: set[str] = set()
     handed: set[ast.AST] = set()
     dicts = every(body, ast.Dict)
@@ -755,11 +819,11 @@ def _uses(fork: Fork, draw: Draw, name: str) -> list[str]:
         if isinstance(key, ast.Constant) and getattr(value, "id", "") == name:
             keys.add(str(key.value))
             handed.add(value)
-    places = [
-        fork.repo.at(RENDERER, node.lineno)
+    places: dict[ast.AST, str] = {
+        node: fork.repo.at(RENDERER, node.lineno)
         for node in every(body, ast.Name)
         if node.id == name and isinstance(node.ctx, ast.Load) and node not in handed
-    ]
+    }
     for module, tree in fork.trees.items():
         still = (node for node, method in _method_calls(tree) if method in fork.still)
         passed = {inner for node in still for inner in nodes(node)} | _only_named(tree)
@@ -769,7 +833,7 @@ def _uses(fork: Fork, draw: Draw, name: str) -> list[str]:
             if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "get":
                 index = node.args[0] if node.args else None
             if getattr(index, "value", None) in keys and keys and node not in passed:
-                places.append(fork.repo.at(module, node.lineno))  # type: ignore[attr-defined]
+                places[node] = fork.repo.at(module, node.lineno)  # type: ignore[attr-defined]
     return places
 
 

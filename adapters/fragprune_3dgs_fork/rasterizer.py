@@ -15,8 +15,17 @@ from fragprune_plugins.adapting import HostRepo, is_off
 
 Sum = Literal["count", "weight"]
 Role = (
-    Sum | Literal["image", "radii", "depth", "invdepth", "alpha", "objects", "unproved", "unread"]
+    Sum
+    | Literal["image", "radii", "depth", "invdepth", "alpha", "objects", "plane"]
+    | Literal["unproved", "unread"]
 )
+
+POSES = {"theta", "rho"}
+"""Arguments that only get a camera's gradients: how it turns and moves, 0 at every call."""
+SERVED = {"dc", *POSES}
+"""Further arguments that the engines know."""
+SCREEN = re.compile(r"means2D_\w+")
+"""Further tensors that get a gradient on the screen, by which Gaussians are densified."""
 
 _Z = r"depths\[collected_id\[j\]\]"
 _DECLARED = re.compile(r"(?:float|auto)(\w+)=([^;]+);")
@@ -28,6 +37,12 @@ _BLENDED = re.compile(r"(\w+)\[ch\]\+=\w+\[collected_id\[j\]\*\w+\+ch\]\*alpha\*
 """A sum over the ray for each channel."""
 _PULLED = re.compile(r"dL_dalpha\+=\(?\([\w.]+-accum_\w+(\[ch\])?\)\*")
 """What a sum adds to the gradient of alpha: one over channels, as that of colours, or another."""
+_PLANE = re.compile(
+    r"\bout_(\w+)\[pix_id\]=(\w+)\[4\]/-\(\2\[0\]\*ray\.x\+\2\[1\]\*ray\.y\+\2\[2\]\+1\.0e-8\);"
+)
+"""Depth at which a pixel's ray meets a plane: channels 1 to 3 are its normal, 5 its distance."""
+_RAY = ("ray={(pixf.x-cx)/focal_x,(pixf.y-cy)/focal_y};", "float(width*0.5),float(height*0.5)")
+"""Of the pixel, through a camera whose axis is the picture's middle."""
 _ADDED = re.compile(r"([{;])atomicAdd\(&\(?(\w+)\[collected_id\[j\]\]\)?,(alpha\*T|1\.?0?)\);")
 """A sum for each Gaussian over its fragments, in a statement of its own."""
 _DRAWN = re.compile(r"if\(test_T<0\.0001\)\{done=true;continue;\}")
@@ -70,6 +85,9 @@ def meaning(repo: HostRepo, call: graphdeco.CallInSource, name: str) -> Output:
     shares = {f"{depth}/{weight}" for depth in depths for weight in weights}
     if "T=test_T;" in text:
         weights.add("1-T")
+    planes = {match[1]: match[2] for match in _PLANE.finditer(text)}
+    if planes.get(name) in _sums(text) and all(each in text for each in _RAY):
+        return Output(name, "plane")
     if "depth" in name:
         inverse = set(_INVERSE.findall(text))
         known = {"depth": depths, "invdepth": inverse, "unproved": shares}
@@ -120,17 +138,20 @@ def blended_argument(repo: HostRepo, call: graphdeco.CallInSource) -> str:
 
     "" if there is none, or if several could be it.
     """
-    further = sorted(call.arguments - {"dc"})
+    further = [each for each in call.arguments - SERVED if not SCREEN.fullmatch(each)]
     text = "".join(kernels.normal_sources(repo, call.package))
     return further[0] if len(further) == 1 and _blended(text) else ""
 
 
 def _blended(text: str) -> str:
     """What a kernel calls the picture of the channels that it blends; "" unless there is one."""
-    sums = {match[1] for match in _BLENDED.finditer(text)}
     stored = re.findall(r"\bout_(\w+)\[ch\*H\*W\+pix_id\]=(\w+)\[ch\];", text)
-    found = {out for out, value in stored if value in sums}
+    found = {out for out, value in stored if value in _sums(text)}
     return found.pop() if len(found) == 1 else ""
+
+
+def _sums(text: str) -> set[str]:
+    return {match[1] for match in _BLENDED.finditer(text)}
 
 
 def _words(name: str) -> set[str]:
@@ -153,6 +174,26 @@ def _sum_for_gaussians(text: str, name: str) -> Sum | None:
 
 
 # -- settings --------------------------------------------------------------------------------------
+
+
+def only_asks(repo: HostRepo, package: str, setting: str) -> bool:
+    """Whether a setting only asks for the channels that are blended beside the colours.
+
+    Kernels then name it where they hand it on, and before blocks that make these sums alone.
+    """
+    text = "".join(kernels.normal_sources(repo, package))
+    blocks = re.findall(rf"if\({setting}\)\{{([^{{}}]*)\}}", text)
+    for each in blocks:
+        text = text.replace(f"if({setting}){{{each}}}", "")
+    made = "".join(blocks)
+    targets = set(re.findall(r"(\w+)(?:\[[^]=]*\])?[-+*/]?=(?!=)", made)) - _sums(made)
+    more = re.search(r"\b(atomic|continue|return|break)|trap\(", made)
+    handed = re.sub(rf"(?<=[,(])(?<!if\(){setting}(?=[,)])", "", text)
+    return (
+        all(re.match(r"out_(?!color)|int", each) for each in targets)
+        and bool(blocks and not more)
+        and not re.search(rf"(?<!\w){setting}\b", handed)
+    )
 
 
 def changed_gradients(repo: HostRepo, package: str, setting: str) -> frozenset[str] | None:

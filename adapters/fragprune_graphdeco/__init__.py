@@ -25,6 +25,7 @@ from fragprune_graphdeco.adapter import (
     default,
     group_names,
     model_seam,
+    no_noise,
     optimizers,
     rasterizer_seam,
 )
@@ -52,6 +53,7 @@ __all__ = [
     "group_names",
     "model_seam",
     "needy",
+    "no_noise",
     "optimizers",
     "rasterizer_seam",
     "reaches",

@@ -11,7 +11,7 @@ from pathlib import Path
 from types import MappingProxyType, ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from fragprune_graphdeco import plain
+from fragprune_graphdeco import plain, reading
 from fragprune_graphdeco.call import RasterizerCall, drawing_functions, read_calls
 from fragprune_graphdeco.densifying import clones, splits
 from fragprune_graphdeco.kernels import SPLAT, Kernel, read_kernels, vendored
@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 
     from fragprune_plugins.adapting import Model, RasterOutputs
 
-MODEL, RENDERER = "scene.gaussian_model", "gaussian_renderer"
+MODEL, RENDERER = reading.MODEL, "gaussian_renderer"
 CAMERAS = "utils.camera_utils"
 
 
@@ -64,6 +64,11 @@ def optimizers(call: SeamCall) -> list[Any]:
     main = call.model.optimizer
     own = [each for each in vars(call.model).values() if hasattr(each, "param_groups")]
     return [main, *(each for each in own if each is not main)]
+
+
+def no_noise(call: SeamCall) -> float:
+    """A rate of 0: hosts multiply the noise that they add to positions by it."""
+    return 0.0
 
 
 def completed(call: SeamCall) -> Any:

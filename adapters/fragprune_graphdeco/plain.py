@@ -119,13 +119,13 @@ def _read_plain(repo: HostRepo) -> Plain:
         *_of_makers(repo, module, name),
     ]
     moved = frozenset(each for each, moves in moving.items() if moves)
-    elsewhere = "" if repo.path("scene.gaussian_model") else f"{name} is in {module}"
+    elsewhere = "" if module == reading.MODEL else f"{name} is in {module}"
     return Plain(tuple(dict.fromkeys(reasons)), name, moved, elsewhere=elsewhere)
 
 
 def _without(repo: HostRepo) -> str:
     """Why no model was found that saves a PLY."""
-    module = "scene.gaussian_model"
+    module = reading.MODEL
     if repo.path(module) and repo.tree(module) is None:
         return "its scene/gaussian_model.py is no valid Python"
     if repo.function(module, "GaussianModel.__init__"):
@@ -137,12 +137,14 @@ def _without(repo: HostRepo) -> str:
 
 
 def _models(repo: HostRepo) -> Iterator[tuple[str, str]]:
-    """Module and class of each model that saves a PLY, ``gaussian_model`` first: those in
-    ``scene``, or else those that a script trains.
+    """Module and class of each model that saves a PLY, the one that ``scene`` exports first: those
+    in ``scene``, or else those that a script trains.
     """
     files = sorted(each.stem for each in (repo.root / "scene").glob("*.py"))
     order = ("gaussian", "model")
     files.sort(key=lambda stem: (*(word not in stem for word in order), len(stem)))
+    home = reading.home_of(repo, "scene").removeprefix("scene.")
+    files.sort(key=lambda stem: stem != home)
     own = [f"scene.{each}" for each in files if each.isidentifier()]
     found = [*_saving(repo, own, "save_ply")]
     yield from found or _saving(repo, _trained(repo), "save_ply", "training_setup")
@@ -266,7 +268,7 @@ def _of_getters(repo: HostRepo, module: str, name: str) -> Iterator[tuple[str, b
     """Getters of other values than the PLY's; true if only where an attribute was set later."""
     saved = ast.unparse(repo.function(module, f"{name}.save_ply") or ast.Pass())
     if repo.function(module, f"{name}.get_xyz") is None:  # a class that only saves
-        module, name = "scene.gaussian_model", "GaussianModel"
+        module, name = reading.MODEL, "GaussianModel"
     off = reading.unset(repo, module, name)
     always = reading.computed_getters(repo, module, name, off)
     options = reading.options(repo, module, name, _training(repo))
@@ -568,7 +570,8 @@ class Drawing:
 
     def _given_by(self, name: str) -> list[str]:
         """The attributes of the model that an attribute gives: itself, or what its method does."""
-        method = self.repo.function("scene.gaussian_model", f"GaussianModel.{name}")
+        home = reading.home_of(self.repo, "scene") or reading.MODEL
+        method = self.repo.function(home, f"GaussianModel.{name}")
         body = method.body[-1] if method and len(method.body) == 1 else None
         value = body.value if isinstance(body, ast.Return) else None
         given = value.elts if isinstance(value, ast.Tuple) else []

@@ -21,6 +21,8 @@ from fragprune_plugins.adapting import (
     nodes,
 )
 
+MODEL = "scene.gaussian_model"
+"""Where 3DGS defines its model."""
 GETTERS = ("xyz", "opacity", "scaling", "rotation")
 """Values of a model that its properties give, by the names of their parameters."""
 _SHAPES = {"repeat", "expand", "view", "reshape", "squeeze", "unsqueeze", "contiguous"}
@@ -126,7 +128,7 @@ def failing(repo: HostRepo, scripts: Collection[str]) -> list[str]:
     """
     found = [
         f"{path} imports {name}, which is no module of this folder"
-        for module in ("gaussian_renderer", "scene", "scene.gaussian_model", "train")
+        for module in ("gaussian_renderer", "scene", MODEL, "train")
         for node in getattr(repo.tree(module), "body", ())
         if isinstance(node, ast.Import | ast.ImportFrom)
         for name in repo.imported_by(module, node)[:1]
@@ -134,7 +136,8 @@ def failing(repo: HostRepo, scripts: Collection[str]) -> list[str]:
         if _ELSEWHERE.fullmatch(name) and not _there(repo, name.split(".")[0])
     ][:1]
     for script in scripts:
-        tree = repo.tree(module_of(script))
+        tree, home = repo.tree(module_of(script)), home_of(repo, module_of(script))
+        found += [f"{script} trains the GaussianModel of {home}"] * (home not in ("", MODEL))
         found += [f"{script} trains by jittor"] * ("jittor" in imported(tree))
         found += [
             f"{script} compiles {node.name}, which trains"
@@ -144,6 +147,11 @@ def failing(repo: HostRepo, scripts: Collection[str]) -> list[str]:
         ]
         found += _misfits(repo, module_of(script))[:1]
     return found
+
+
+def home_of(repo: HostRepo, module: str) -> str:
+    """The module of the checkout that defines what a module calls GaussianModel; "" if unknown."""
+    return _definition(repo, module, "GaussianModel")[0]
 
 
 def owners(tree: ast.AST | None) -> set[str]:
@@ -159,10 +167,15 @@ def _misfits(repo: HostRepo, module: str) -> tuple[str, ...]:
     given or asked for.
     """
     tree, misfits = repo.tree(module), tuple[str, ...]()
+    asked = (each for each in every(tree, ast.If) if "hasattr(" in ast.unparse(each.test))
     parts = [node.body for node in every(tree, ast.If) if isinstance(node.test, ast.Name)]
+    parts += [node.body for node in asked]
     parts += [node.body for node in every(tree, ast.Try)]
     tried = {inner for part in parts for each in part for inner in nodes(each)}
-    models, model = owners(tree), _definition(repo, "scene.gaussian_model", "GaussianModel")
+    model = _definition(repo, MODEL, "GaussianModel")[1]
+    pairs = [(ast.unparse(to), ast.unparse(value)) for to, value in assigned(tree)]
+    models = {to for to, value in pairs if value.startswith("GaussianModel(")}
+    models -= {to for to, value in pairs if not value.startswith("GaussianModel(")}
     reached = by_default(repo, ("arguments", module), tree) if tree else ()
     texts = ast.unparse(tree or ast.Pass()) + ast.unparse(model or ast.Pass())
     for node in (each for each in reached if isinstance(each, ast.Call) and each not in tried):
@@ -176,7 +189,7 @@ def _misfits(repo: HostRepo, module: str) -> tuple[str, ...]:
             if found is None and not inherits:
                 misfits += (f"calls {name}, which its model lacks ({at})",)
         elif not owner and _bindings(tree)[name] == 1:
-            found = model if name == "GaussianModel" else _definition(repo, module, name)
+            found = model if name == "GaussianModel" else _definition(repo, module, name)[1]
         if why := _misfit(found, node, bool(owner)):
             misfits += (f"its call of {name} {why}, which fails ({at})",)
     return misfits
@@ -195,15 +208,19 @@ def _bindings(tree: ast.AST | None) -> Counter[str]:
     )
 
 
-def _definition(repo: HostRepo, module: str, name: str, deep: int = 3) -> ast.stmt | None:
-    """The function or class of a name in a module, also one that it imports from the checkout."""
+def _definition(
+    repo: HostRepo, module: str, name: str, deep: int = 3
+) -> tuple[str, ast.stmt | None]:
+    """The function or class of a name in a module, also one that it imports from the checkout, with
+    the module that defines it.
+    """
     for node in getattr(repo.tree(module), "body", ()):
         if isinstance(node, ast.FunctionDef | ast.ClassDef) and node.name == name:
-            return node
+            return module, node
         for each in node.names if isinstance(node, ast.ImportFrom) and deep else ():
             if (each.asname or each.name) == name:
                 return _definition(repo, repo.absolute(module, node), each.name, deep - 1)
-    return None
+    return "", None
 
 
 def _misfit(called: ast.AST | None, call: ast.Call, of_model: bool) -> str:

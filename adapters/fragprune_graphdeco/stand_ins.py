@@ -37,7 +37,8 @@ def rasterizer(
     draw: Callable[[HostCall], Any],
     also: tuple[str, ...] = (),
 ) -> ModuleType:
-    """The rasterizer package: settings, rasterizer and, for late revisions, the sparse Adam.
+    """The rasterizer package: settings, rasterizer, MCMC's relocation and, for late revisions, the
+    sparse Adam.
 
     Args:
         settings: field names of the settings tuple, in order.
@@ -80,6 +81,7 @@ def rasterizer(
         package,
         GaussianRasterizationSettings=settings_type,
         GaussianRasterizer=GaussianRasterizer,
+        compute_relocation=compute_relocation,
         **also_sparse,
     )
 

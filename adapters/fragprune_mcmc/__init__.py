@@ -7,17 +7,16 @@ adds noise to the positions, scaled by the rate that ``update_learning_rate`` re
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+import fragprune_graphdeco as graphdeco
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall, model_seam
 from fragprune_plugins.adapting import (
     AlignmentError,
     ConfigFile,
-    HostCall,
     HostInfo,
     Role,
     RowTrace,
@@ -31,22 +30,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MCMCDialect(GraphdecoDialect):
-    """Vanilla's call, with ``is_used`` as third output and the relocation formula beside it."""
+    """Vanilla's call, with ``is_used`` as third output."""
 
     returned = ("image", "radii", "is_used")  # the last is passed on and never read
-
-    def modules(self, draw: Callable[[HostCall], Any]) -> dict[str, ModuleType]:
-        """Vanilla's stand-ins, with the relocation formula in the rasterizer's module."""
-        from fragprune_graphdeco import stand_ins
-
-        modules = super().modules(draw)
-        vars(modules[self.package])["compute_relocation"] = stand_ins.compute_relocation
-        return modules
-
-
-def no_noise(call: SeamCall) -> float:
-    """Return a rate of 0: the host multiplies the noise on positions by it."""
-    return 0.0
 
 
 @contextmanager
@@ -110,7 +96,10 @@ class MCMC(GraphdecoAdapter):
     dialect_type = MCMCDialect
     flags = {"config": ConfigFile("--config")}  # its values override the others
     seams = (
-        *revised(GraphdecoAdapter.seams, {"GaussianModel.update_learning_rate": {"how": no_noise}}),
+        *revised(
+            GraphdecoAdapter.seams,
+            {"GaussianModel.update_learning_rate": {"how": graphdeco.no_noise}},
+        ),
         model_seam(Role.REARRANGE, "relocate_gs", "dead_mask", how=following_copies),
         model_seam(Role.REARRANGE, "add_new_gs", "cap_max", how=following_copies),
     )

@@ -90,6 +90,44 @@ def test_every_value_is_in_its_place_with_its_gradient(scene, objects):
     torch.testing.assert_close(found, expected)
 
 
+MAPS = tuple(Output(each, each) for each in ("image", "radii", "objects", "plane"))
+PLANES = replace(FORK, outputs={"p": MAPS}, asking=frozenset({"asked"}))
+
+
+@pytest.mark.parametrize("count", [5, 9])
+def test_a_plane_that_channels_hold_is_met_by_every_pixels_ray(scene, count):
+    engine, dialect = create_engine("reference"), replace(DIALECT, fork=PLANES)
+    scene.splats.opacities.data[10:] = 0  # few enough to leave pixels empty
+    channels = torch.rand(40, count, generator=torch.Generator().manual_seed(1)) + 0.5
+    call = call_of(scene, channels.requires_grad_(True), asked=True)
+    drawn = dialect.answer(call, dialect.unpack(call), lambda each: engine.rasterize(each, None))
+    normals, distances = drawn[2][:3].double(), drawn[2][4].double()
+    empty = drawn[2][4] == 0
+    assert empty.any()
+    assert not empty.all()
+    for y, x in (~empty).nonzero()[::97]:
+        across = (float(x) - scene.view.width / 2) / (scene.view.width / 2) * scene.view.tan_fov_x
+        down = (float(y) - scene.view.height / 2) / (scene.view.height / 2) * scene.view.tan_fov_y
+        ray = torch.tensor([across, down, 1.0], dtype=torch.float64)
+        met = -distances[y, x] / (normals[:, y, x] @ ray)
+        torch.testing.assert_close(drawn[3][0, y, x].double(), met, rtol=1e-5, atol=1e-6)
+    assert not drawn[3][0][empty].any()
+    (found,) = torch.autograd.grad(drawn[3].sum(), channels)  # 1e8 if empty pixels had one
+    assert 0 < found.abs().max() < 1e4
+
+
+def test_channels_that_a_host_does_not_ask_for_are_not_drawn_and_not_read(scene, objects):
+    engine, dialect = create_engine("reference"), replace(DIALECT, fork=PLANES)
+    for given, asked in ((objects, False), (None, True), (None, False)):
+        call = call_of(scene, given, asked=asked)
+        inputs = dialect.unpack(call)
+        assert inputs.splats.features is None
+        _, _, *values = dialect.answer(call, inputs, lambda each: engine.rasterize(each, None))
+        for value in values:
+            with pytest.raises(EngineError, match="the rasterizer's value"):
+                value.mean()
+
+
 @pytest.mark.parametrize("detached", ["objects", "depth", "alpha", "invdepth"])
 def test_a_value_that_moves_no_gaussian_is_drawn_all_the_same(scene, objects, detached):
     roles = tuple(replace(each, detached=each.role == detached) for each in VALUES["p"])

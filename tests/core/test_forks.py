@@ -200,6 +200,86 @@ def test_blended_channels_are_known_by_argument_and_kernel(tmp_path, name):
     assert "objects, which is empty unless asked for" in errors(empty)[0]
 
 
+RAY = """
+renderCUDA(ranges, float(width * 0.5f), float(height * 0.5f), maps, with_maps);
+const float2 ray = { (pixf.x - cx) / focal_x, (pixf.y - cy) / focal_y };
+"""
+MAPS = """
+if (with_maps) {
+    for (int ch = 0; ch < MAPS; ch++)
+        M[ch] += maps[collected_id[j] * MAPS + ch] * alpha * T;
+}
+"""
+PLANE = """
+if (with_maps) {
+    for (int ch = 0; ch < MAPS; ch++)
+        out_maps[ch * H * W + pix_id] = M[ch];
+    out_meeting[pix_id] = M[4] / -(M[0] * ray.x + M[1] * ray.y + M[2] + 1.0e-8);
+}
+"""
+PLANES = {
+    "as PGSR's": ("", "", ""),
+    "a nested block": ("{\n    for", "{ if (near) { }\n    for", "with_maps, unknown"),
+    "a block that skips": ("{\n    for", "{ continue;\n    for", "with_maps, unknown"),
+    "a block that dims": ("{\n    for", "{ T = 0;\n    for", "with_maps, unknown"),
+    "a block that paints": ("{\n    for", "{ out_color[0] = 1;\n    for", "with_maps, unknown"),
+    "a choice": ("RAY", "float s = with_maps ? 1 : 2;", "with_maps, unknown"),
+    "a block that counts": ("{\n    for", "{ atomicAdd(&hits, 1);\n    for", "with_maps, unknown"),
+    "another depth": ("M[2] + ", "M[2] * M[3] + ", "meeting, read in train.py"),
+    "another middle": ("width * 0.5f", "width * 0.4f", "meeting, read in train.py"),
+    "of another sum": ("M[4] / ", "N[4] / ", "meeting, read in train.py"),
+}
+
+
+@pytest.mark.parametrize("what", PLANES)
+def test_channels_and_their_planes_depth_may_be_asked_for_by_a_setting(tmp_path, what):
+    old, new, why = PLANES[what]
+    filled = "    maps = torch.zeros((9, 5))\n    maps[:, 4] = pc.get_distance\n    rasterizer ="
+    repo = fork(
+        tmp_path,
+        ("    rasterizer =", filled),
+        (USED[0], USED[1].format("meeting")),
+        values="image, radii, out_maps, meeting",
+        settings=", with_maps=pipe.maps",
+        arguments=", all=maps, means2D_abs=pc.get_xyz",
+        kernel=f"RAY{RAY}{MAPS}{PLANE}".replace(old or "RAY", new).replace("RAY", ""),
+    )
+    if why:
+        assert why in errors(repo)[0]
+        return
+    assert errors(repo) == []
+    read = read_fork(repo)
+    assert [each.role for each in read.outputs[PACKAGE]] == ["image", "radii", "objects", "plane"]
+    assert (read.asking, read.blended, read.screens) == (
+        {"with_maps"},
+        {PACKAGE: "all"},
+        {"means2D_abs"},
+    )
+
+
+STEPS = "        gaussians.optimizer.step()\n"
+THINS = "            gaussians.thin_out(mask)\n"
+START = "\n\ndef training("
+SCORES = '\n\ndef scores():\n    return render(view, gaussians, pipe, background)["hits"]\n'
+EARLY = {
+    "in the branch": [(THINS, f'            mask = package["hits"] > 0\n{THINS}')],
+    "in a function": [(START, SCORES + START), (THINS, f"            mask = scores()\n{THINS}")],
+}
+
+
+@pytest.mark.parametrize("where", EARLY)
+def test_a_value_by_which_a_host_densifies_is_not_read_in_stage_2(tmp_path, where):
+    repo = fork(tmp_path / "early", *EARLY[where], values="image, radii, hits", kernel=";")
+    assert errors(repo) == []
+    warned = [each.found for each in ForkAdapter().match(repo).findings]
+    assert "hits, by which it densifies" in warned
+    assert read_fork(repo).outputs[PACKAGE][2].role == "unread"
+    use = '        print(package["hits"])\n' if where == "in the branch" else "        scores()\n"
+    later = (STEPS, f"{use}{STEPS}")
+    read = fork(tmp_path / "later", *EARLY[where], later, values="image, radii, hits", kernel=";")
+    assert "hits, read in train.py" in errors(read)[0]
+
+
 PULL = "dL_dalpha += ({} - accum_{}[ch]) * dL_{};"
 BACKWARD = {
     "both": (PULL.format("c", "rec", "dchannel") + PULL.format("f", "rec_F", "dF"), False),
@@ -814,6 +894,19 @@ CALLED = {
         "if opt.thin == 2 or opt.rate > 0:\n                gaussians.prune(mask)",
     ),
     "of a class that inherits": (STATEMENT, "gaussians.cuda()"),
+    "of a dict that holds a model": (
+        "    for iteration in",
+        '    of = {}\n    of["a"] = gaussians\n    of["b"] = GaussianModel(3)\n    of.keys()\n'
+        "    for iteration in",
+    ),
+    "where it is asked for": (
+        STATEMENT,
+        'if hasattr(gaussians, "prune"):\n                gaussians.prune(mask)',
+    ),
+    "of a variable with models of two classes": (
+        "\n\ndef training(",
+        "\n\ndef start():\n    gaussians = Bound()\n    gaussians.bind()\n\n\ndef training(",
+    ),
     "of another function of this name": (
         "    for iteration in",
         "    def l1_loss(a): ...\n    l1_loss(1, 2)\n    for iteration in",
@@ -823,16 +916,28 @@ CALLED = {
 
 @pytest.mark.parametrize("what", CALLED)
 def test_a_call_that_may_not_be_reached_or_not_fail_is_no_failure(tmp_path, what):
-    flags = (
-        "\ndef read_flags",
-        (
-            "\nparser.add_argument('--rate', default=0.0)\nparser.add_argument('--thin', default=1)"
-            "\n\ndef read_flags"
-        ),
+    given = "\n".join(
+        f"parser.add_argument('--{name}', default={value})"
+        for name, value in (("rate", 0.0), ("thin", 1), ("save_iterations", []))
     )
+    flags = ("\ndef read_flags", f"\n{given}\n\ndef read_flags")
     inherits = ("class GaussianModel:", "class GaussianModel(nn.Module):")
     changes = [inherits] if "inherits" in what else []
     assert errors(fork(tmp_path, CALLED[what], flags, *changes)) == []
+
+
+def test_the_model_that_the_scene_exports_is_the_one_that_is_read(tmp_path):
+    repo = fork(tmp_path)
+    other = (
+        (tmp_path / "scene/gaussian_model.py").read_text().replace("torch.sigmoid", "torch.tanh")
+    )
+    (tmp_path / "scene/late_model.py").write_text(other)
+    scene = tmp_path / "scene/__init__.py"
+    scene.write_text(f"from scene.late_model import GaussianModel\n{scene.read_text()}")
+    repo = HostRepo(tmp_path)
+    assert "its opacity_activation is torch.tanh (scene/late_model.py" in errors(repo)[0]
+    (tmp_path / "scene/late_model.py").write_text(other.replace("torch.tanh", "torch.sigmoid"))
+    assert "train.py trains the GaussianModel of scene.late_model" in errors(HostRepo(tmp_path))[0]
 
 
 def test_what_a_script_changes_until_densification_ends_ends_before_stage_2(tmp_path):
@@ -840,6 +945,36 @@ def test_what_a_script_changes_until_densification_ends_ends_before_stage_2(tmp_
     assert errors(repo) == []
     (warned,) = (each.found for each in read_fork(repo).findings if each.code == "row-change")
     assert "which changes _opacity, ends before stage 2" in warned
+
+
+RATE = (
+    "        gaussians.update_learning_rate(iteration)",
+    "        rate = gaussians.update_learning_rate(iteration)",
+)
+NOISE = {
+    "by the rate": ("noise = torch.randn(9, 3) * rate * 9\n        noise = spread @ noise", True),
+    "the rate itself": ("noise = rate * torch.randn(9, 3)", True),
+    "with an offset": ("noise = rate + torch.randn(9, 3)", False),
+    "of another rate": ("noise = torch.randn(9, 3) * opt.rate", False),
+    "or another": (
+        "noise = rate * a\n        noise = b if late else noise\n        noise = b",
+        False,
+    ),
+}
+
+
+@pytest.mark.parametrize("what", NOISE)
+def test_noise_is_as_large_as_the_rate_which_is_zero_in_stage_2(tmp_path, what):
+    made, served = NOISE[what]
+    step = "        gaussians.optimizer.step()\n"
+    moved = f"{step}        {made}\n        gaussians._xyz.add_(noise)\n"
+    repo = fork(tmp_path, RATE, (step, moved))
+    if not served:
+        assert "changes _xyz outside" in errors(repo)[0]
+        return
+    assert errors(repo) == []
+    (stepping,) = (each for each in ForkAdapter().seams_for(repo) if each.role == Role.STEP)
+    assert stepping.how(SimpleNamespace()) == 0
 
 
 @pytest.mark.parametrize("what", ["_xyz.grad[rows] = 0", "_xyz.requires_grad = False"])
