@@ -424,15 +424,15 @@ class ForkAdapter(GraphdecoAdapter):
         gradient on the screen is another.
 
         Raises:
-            UsageError: these, or an option under which the host draws by another function.
+            UsageError: these, or an option under which it draws or changes its model otherwise.
         """
         given = {word.partition("=")[0] for word in arguments}
         for name in read_fork(repo).options:
             if f"--{name}" in given:
                 raise UsageError(
                     f"--{name}",
-                    "a drawing function that was not read",
-                    f"those that {', '.join(read_fork(repo).scripts)} draws by without it",
+                    "other draws, other values of the rasterizer, or other changes of the model",
+                    f"what was read of {', '.join(read_fork(repo).scripts)}, without it",
                     "Leave it out, or prune its PLY: fragprune finetune.",
                 )
         if stage == "joint" and (scaled := read_fork(repo).scaled):

@@ -86,7 +86,8 @@ class Fork:
         answering: those whose result they read, while they densify.
         setups: methods that make the optimizer.
         blended: by package, the argument with channels that are blended beside the colours.
-        options: off by default, under which scripts draw by other functions.
+        options: off by default, under which scripts draw by other functions, change the model or
+            read a value whose meaning is unknown.
         off: settings and arguments of the rasterizer that are None or False by default.
         scaled: settings that change the gradient on the screen alone, in its backward pass.
         asking: settings without which a rasterizer leaves out the channels beside the colours.
@@ -151,7 +152,7 @@ class Fork:
     def settings(self) -> dict[str, tuple[str, ...]]:
         """Names of the settings, by rasterizer, also of those that no script reaches."""
         found: dict[str, tuple[str, ...]] = {}
-        for name in graphdeco.drawing_functions(self.repo, RENDERER):
+        for name in self.drawing:
             for call in graphdeco.read_calls(self.repo, RENDERER, name):
                 found.setdefault(call.package, call.settings)
         return found | {call.package: call.settings for draw in self.draws for call in draw.calls}
@@ -163,6 +164,32 @@ class Fork:
         """The scripts and the checkout's own modules that they import, without model and draws."""
         seen = reading.reached(self.repo, map(reading.module_of, self.scripts), RENDERER)
         return {each: tree for each, tree in seen.items() if not _OF_MODELS.search(each)}
+
+    @cached_property
+    def drawing(self) -> list[str]:
+        """The functions that draw."""
+        return graphdeco.drawing_functions(self.repo, RENDERER)
+
+    @cached_property
+    def optional(self) -> dict[ast.AST, frozenset[str]]:
+        """What scripts do only under options that are off by default, with their names.
+
+        Without those that a script itself sets, as all may be from a file.
+        """
+        own = [self.tree(each) for each in self.scripts]
+        made = {
+            to.attr for each in own for to, _ in assigned(each) if isinstance(to, ast.Attribute)
+        }
+        found: dict[ast.AST, frozenset[str]] = {}
+        if any("setattr(" in ast.unparse(each) for each in own):
+            return found
+        for node in (node for tree in self.trees.values() for node in every(tree, ast.If)):
+            taken = reading.decided(self.repo, self.options_in, node.test)
+            options = reading.options_of(self.repo, self.options_in, node.test)
+            if taken is not None and made.isdisjoint(options):
+                skipped = node.orelse if taken else node.body
+                found |= {inner: options for each in skipped for inner in nodes(each)}
+        return found
 
     @cached_property
     def early(self) -> set[ast.AST]:
@@ -268,7 +295,7 @@ def _check_script(fork: Fork, script: str) -> None:
         found = f"draws pictures of another size than the camera's, {size}"
         expected = "the camera's: stage 2 would begin with the first of its sizes again"
         fork.refuse("script", script, found, expected)
-    if several := _trainings(fork.repo, reading.module_of(script)):
+    if several := _trainings(fork, reading.module_of(script)):
         fork.refuse("script", script, *several)
     if until := _rests(tree):
         fork.refuse("script", script, f"its optimizer steps only where {until}", "to its end")
@@ -320,16 +347,19 @@ def _is_loop(node: ast.AST) -> bool:
     return isinstance(node, ast.For | ast.While)
 
 
-def _trainings(repo: HostRepo, module: str) -> tuple[str, str] | None:
+def _trainings(fork: Fork, module: str) -> tuple[str, str] | None:
     """What goes backward more than once in one pass of a script, and what is expected.
 
     Of two branches one is passed; what a function does counts where it is called.
     """
-    body = getattr(repo.tree(module), "body", ())
+    body = getattr(fork.repo.tree(module), "body", ())
     functions = {each.name: each for each in body if isinstance(each, ast.FunctionDef)}
     training, several = set[str](), list[str]()
 
     def passes(node: ast.AST, looped: bool = False) -> int:
+        if node in fork.optional:
+            fork.options |= fork.optional[node] if "backward(" in ast.unparse(node) else set()
+            return 0
         if isinstance(node, ast.If):
             return max(sum(passes(each, looped) for each in b) for b in (node.body, node.orelse))
         own = 0
@@ -348,7 +378,7 @@ def _trainings(repo: HostRepo, module: str) -> tuple[str, str] | None:
     most = max(sum(map(passes, main)), *map(passes, functions.values()), 0)
     if most < 2:
         return None
-    several += [each for each in training if len(repo.calls(module, each)) > 1]
+    several += [each for each in training if len(fork.repo.calls(module, each)) > 1]
     if several:
         return f"several calls of {several[0]}, which trains", "one training"
     places = f"{most} places that go backward, perhaps in one iteration"
@@ -481,7 +511,9 @@ def _read_methods(fork: Fork) -> None:
                 still |= {name}
                 owner = ast.unparse(node.func.value)  # type: ignore[attr-defined]
                 own = _MODELS.search(owner) or owner.split("[")[0] in owners
-                if own and node in fork.early and node not in statements:
+                if own and node in fork.optional and node not in statements:
+                    fork.options |= fork.optional[node]
+                elif own and node in fork.early and node not in statements:
                     fork.answering |= {name}
                 elif own and node not in statements:
                     at = fork.repo.at(module, node.lineno)
@@ -517,8 +549,8 @@ def _taken_back(restore: Function) -> list[int]:
     return [len(each.elts) for each in several if not every(each, ast.Starred)]
 
 
-def _assigned(body: ast.AST, owner: str = "") -> Iterator[tuple[int, str]]:
-    """Lines that assign a parameter of a model, or change its values in place."""
+def _assigned(body: ast.AST, owner: str = "") -> Iterator[tuple[ast.AST, str]]:
+    """What assigns a parameter of a model, or changes its values in place."""
     for node in nodes(body):
         targets: list[ast.expr] = []
         if isinstance(node, ast.Assign):
@@ -537,7 +569,7 @@ def _assigned(body: ast.AST, owner: str = "") -> Iterator[tuple[int, str]]:
                         break
                     if isinstance(inner, ast.Attribute) and inner.attr in PARAMETERS:
                         if not owner or ast.unparse(inner.value) == owner:
-                            yield node.lineno, inner.attr  # type: ignore[attr-defined]
+                            yield node, inner.attr
                         break
                     inner = inner.value
 
@@ -545,16 +577,15 @@ def _assigned(body: ast.AST, owner: str = "") -> Iterator[tuple[int, str]]:
 def _read_changes(fork: Fork) -> None:
     """A script that changes parameters itself cannot be held still in stage 2."""
     for module, tree in fork.trees.items():
-        early = {getattr(each, "lineno", 0) for each in nodes(tree) if each in fork.early}
         noisy = _noisy(tree)
         fork.noisy |= bool(noisy)
-        for line, name in _assigned(tree):
-            at = fork.repo.at(module, line)
-            if line in noisy:
-                continue
-            if line in early:
+        for node, name in _assigned(tree):
+            at = fork.repo.at(module, node.lineno)  # type: ignore[attr-defined]
+            if node in fork.optional:
+                fork.options |= fork.optional[node]
+            elif node in fork.early:
                 fork.warn("row-change", at, f"that {at}, which changes {name}, ends before stage 2")
-            else:
+            elif node not in noisy:
                 fork.refuse("row-change", at, f"changes {name} outside the model's methods", "none")
     for script in fork.scripts:
         trained, module = fork.tree(script), reading.module_of(script)
@@ -578,8 +609,8 @@ def _read_changes(fork: Fork) -> None:
                 fork.one_run = fork.one_run or f"{script} does not resume what {name} trains"
 
 
-def _noisy(tree: ast.AST) -> set[int]:
-    """Lines that add a product with the rate of positions to them, as MCMC adds its noise."""
+def _noisy(tree: ast.AST) -> set[ast.AST]:
+    """What adds a product with the rate of positions to them, as MCMC adds its noise."""
     made: dict[str, list[ast.expr]] = {}
     for to, value in assigned(tree):
         made.setdefault(ast.unparse(to), []).append(value)
@@ -602,7 +633,7 @@ def _noisy(tree: ast.AST) -> set[int]:
         return bool(fresh) and all(map(product, fresh))
 
     return {
-        node.lineno
+        node
         for node, name in _method_calls(tree)
         if name == "add_" and len(node.args) == 1 and scaled(getattr(node.args[0], "id", ""))
     }
@@ -637,7 +668,7 @@ def read_getters(fork: Fork) -> list[Finding]:
 
 def _read_draws(fork: Fork) -> None:
     """The drawing functions that a script names, and their calls."""
-    functions = graphdeco.drawing_functions(fork.repo, RENDERER)
+    functions = fork.drawing
     drawing = [each for each in fork.trees.values() if not _mentioned(each).isdisjoint(functions)]
     named = {name for tree in drawing for name in _reached(fork, tree)}
     pairs = ((name, fork.repo.function(RENDERER, name)) for name in functions)
@@ -694,13 +725,10 @@ def _reached(fork: Fork, node: ast.AST) -> Iterator[str]:
     for kind in ("id", "attr", "name"):
         if isinstance(name := getattr(node, kind, None), str):
             yield name
-    test = node.test if isinstance(node, ast.If) else None
-    taken = reading.decided(fork.repo, fork.options_in, test) if test else None
     for each in ast.iter_child_nodes(node):
-        if taken is not None and each in (node.orelse if taken else node.body):  # type: ignore[attr-defined]
-            drawn = graphdeco.drawing_functions(fork.repo, RENDERER)
-            if not _mentioned(each).isdisjoint(drawn):
-                fork.options |= {n.attr for n in nodes(test) if isinstance(n, ast.Attribute)}
+        if each in fork.optional:
+            if not _mentioned(each).isdisjoint(fork.drawing):
+                fork.options |= fork.optional[each]
             continue
         yield from _reached(fork, each)
 
@@ -827,13 +855,16 @@ def _uses(fork: Fork, draw: Draw, name: str) -> dict[ast.AST, str]:
     for module, tree in fork.trees.items():
         still = (node for node, method in _method_calls(tree) if method in fork.still)
         passed = {inner for node in still for inner in nodes(node)} | _only_named(tree)
-        for node in reading.by_default(fork.repo, fork.options_in, tree):
+        for node in nodes(tree):
             read = isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Load)
             index = node.slice if read else None  # type: ignore[attr-defined]
             if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "get":
                 index = node.args[0] if node.args else None
             if getattr(index, "value", None) in keys and keys and node not in passed:
-                places[node] = fork.repo.at(module, node.lineno)  # type: ignore[attr-defined]
+                if node in fork.optional:
+                    fork.options |= fork.optional[node]
+                else:
+                    places[node] = fork.repo.at(module, node.lineno)  # type: ignore[attr-defined]
     return places
 
 

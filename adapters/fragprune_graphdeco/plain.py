@@ -52,7 +52,7 @@ _KEEPS = ("clamp", "clamp_", "contiguous", "squeeze", "unsqueeze", "to", "permut
 """Methods that keep the numbers of a picture."""
 _ADDED = re.compile(r"bg_color|zeros_like\(\w+\)$|\* 0\.0$")
 """What is added to a picture and leaves its Gaussians alone: a background, or zeros."""
-_PICTURES = re.compile(r"mesh_\w+|\w+_(rgb|colou?rs?)")
+_PICTURES = re.compile(r"mesh_\w+|(?!clamp|use)\w+_(rgb|colou?rs?)")
 """Arguments of a rasterizer that are pictures to blend with its own."""
 _RASTERIZER = re.compile(r"(self\.)?\w*rasterizer")
 """What drawing functions call a rasterizer that they made."""
@@ -63,7 +63,7 @@ _GSPLAT = {
 """Arguments of gsplat's ``rasterization`` in order, by their names in 3DGS."""
 _USUAL = {"rasterize_mode": "classic", "camera_model": "pinhole", "eps2d": 0.3}
 """Arguments of it that change the picture, and the values with which it draws as 3DGS does."""
-_SAVES = re.compile(r"\.save_ply\(|scene\w*\.save\(")
+_SAVES = re.compile(r"\.save_ply\w*\(|scene\w*\.save\(")
 _ABSENT = "no model of this family that saves a PLY was found"
 _UNSAVED = "none of its scripts saves a PLY"
 

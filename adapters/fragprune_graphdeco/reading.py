@@ -278,7 +278,7 @@ def decided(repo: HostRepo, modules: Collection[str], test: ast.expr) -> bool | 
     compared = isinstance(test, ast.Compare) and _COMPARED.get(type(test.ops[0]))
     sides = [test.left, *test.comparators] if isinstance(test, ast.Compare) else [test]
     values = [_by_itself(repo, modules, each) for each in sides]
-    if not all(values) or not any(isinstance(each, ast.Attribute) for each in sides):
+    if not all(values) or not any(map(_option, sides)):
         return None
     if len(sides) == 1:
         return bool(values[0][0])
@@ -287,10 +287,26 @@ def decided(repo: HostRepo, modules: Collection[str], test: ast.expr) -> bool | 
     return None
 
 
-def _by_itself(repo: HostRepo, modules: Collection[str], node: ast.expr) -> list[Any]:
+def options_of(repo: HostRepo, modules: Collection[str], test: ast.expr) -> frozenset[str]:
+    """The options that decide a test: those that are off by default, or else all."""
+    known = {
+        _option(each): _by_itself(repo, modules, each) for each in nodes(test) if _option(each)
+    }
+    off = [name for name, value in known.items() if value and not value[0]]
+    return frozenset(off or (name for name, value in known.items() if value))
+
+
+def _option(node: ast.AST) -> str:
+    """The option that an expression is: ``args.x`` or ``getattr(args, "x", ...)``; "" if none."""
+    if isinstance(node, ast.Call) and ast.unparse(node.func) == "getattr":
+        return str(getattr(node.args[1], "value", "")) if len(node.args) > 1 else ""
+    return node.attr if isinstance(node, ast.Attribute) else ""
+
+
+def _by_itself(repo: HostRepo, modules: Collection[str], node: ast.AST) -> list[Any]:
     """The one value of a constant, or of an option by default; [] if it is not known."""
-    option = isinstance(node, ast.Attribute)
-    given = [v for m in modules for v in defaults(repo, m, node.attr)] if option else [node]  # type: ignore[attr-defined]
+    option = _option(node)
+    given = [v for m in modules for v in defaults(repo, m, option)] if option else [node]
     try:
         values = [ast.literal_eval(each) for each in given]
     except (ValueError, TypeError, SyntaxError):

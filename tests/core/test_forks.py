@@ -159,7 +159,10 @@ def test_a_value_that_only_an_option_reads_is_not_read_without_it(tmp_path):
         ),
     )
     on, off = ((option[0], option[1].format(each)) for each in (", default=True", ""))
-    assert errors(fork(tmp_path / "off", off, used, values="image, radii, touched")) == []
+    repo = fork(tmp_path / "off", off, used, values="image, radii, touched")
+    assert errors(repo) == []
+    with pytest.raises(UsageError, match="--sparse"):
+        ForkAdapter().refuse(repo, ["--sparse"], stage="auto", device="cuda")
     found = errors(fork(tmp_path / "on", on, used, values="image, radii, touched"))
     assert "touched, read in train.py" in found[0]
 
@@ -453,7 +456,7 @@ def test_a_drawing_function_for_an_option_that_is_off_is_not_reached(tmp_path, s
     assert errors(repo) == []
     ForkAdapter().refuse(repo, ["--eval"], stage="auto", device="cuda")
     for word in ("--posed", "--posed=1"):
-        with pytest.raises(UsageError, match="a drawing function that was not read"):
+        with pytest.raises(UsageError, match="other draws"):
             ForkAdapter().refuse(repo, [word], stage="auto", device="cuda")
 
 
@@ -924,6 +927,42 @@ def test_a_call_that_may_not_be_reached_or_not_fail_is_no_failure(tmp_path, what
     inherits = ("class GaussianModel:", "class GaussianModel(nn.Module):")
     changes = [inherits] if "inherits" in what else []
     assert errors(fork(tmp_path, CALLED[what], flags, *changes)) == []
+
+
+ASKS = "\n        if {}:\n            {}\n        loss.backward()"
+CHANGES = {
+    "a change": "gaussians._opacity.data.clamp_(0)",
+    "a result": "kept = gaussians.thin_out(mask)",
+    "another step": "loss.backward()",
+}
+MORE_FLAGS = (
+    "\nparser.add_argument('--late', default=0.0)\nparser.add_argument('--end', default=9)\n"
+)
+TESTS = {
+    "off": ("opt.late > 0 and iteration < opt.end", "", True),
+    "asked for in another way": ('getattr(opt, "late", 0.0)', "", True),
+    "on": ("opt.end > 0", "", False),
+    "set by the script": ("opt.late > 0", "\nopt.late = 1\n", False),
+    "set from a file": ("opt.late > 0", "\nsetattr(opt, name, value)\n", False),
+}
+
+
+@pytest.mark.parametrize("what", CHANGES)
+@pytest.mark.parametrize("test", TESTS)
+def test_what_an_option_changes_is_not_changed_without_it(tmp_path, test, what):
+    condition, beside, served = TESTS[test]
+    repo = fork(
+        tmp_path,
+        ("\n        loss.backward()", ASKS.format(condition, CHANGES[what])),
+        ("\ndef read_flags", f"{MORE_FLAGS}{beside}\ndef read_flags"),
+    )
+    if not served:
+        assert errors(repo)
+        return
+    assert errors(repo) == []
+    ForkAdapter().refuse(repo, ["--end", "5"], stage="auto", device="cuda")
+    with pytest.raises(UsageError, match="--late"):
+        ForkAdapter().refuse(repo, ["--late", "1"], stage="auto", device="cuda")
 
 
 def test_the_model_that_the_scene_exports_is_the_one_that_is_read(tmp_path):
