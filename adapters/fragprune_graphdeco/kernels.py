@@ -20,6 +20,8 @@ _DEEPEST = 6
 _NOT_THEIRS = {"third_party", "build", "dist", "site-packages", "node_modules", "glm", "backward"}
 _COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/", re.DOTALL)
 _ALPHA = re.compile(r"\b(?:float|double|auto)\s+alpha\s*=([^;]+);")
+_BLENDS = re.compile(r"1(?:\.0?f?)?\s*-\s*alpha\b|\balpha\s*<\s*1")
+"""What a blended alpha leaves of the light behind it, or when it is too faint to be blended."""
 _BRANCHES = re.compile(r"\balpha\s*=(?!=)([^;]+);")
 """Of an alpha that is declared without a value."""
 _JACOBIAN = re.compile(r"\bJ\s*=\s*glm::mat3(?:x3)?\s*(\([^;]+\))\s*;")
@@ -196,6 +198,8 @@ class _Project:
         for path, position, text in self._found(_ALPHA):
             if re.fullmatch(r"[\d.]+", text):  # a start, which the code below it changes
                 continue
+            if "exp(" not in text and not _BLENDS.search(self.texts[path]):
+                continue  # of another kind, as a place in a triangle
             exponent = self._exponent(path, position, text)
             if exponent is None or "min(0.99," not in text:
                 what = "no exp()" if exponent is None else "not capped at 0.99"

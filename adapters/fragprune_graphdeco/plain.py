@@ -337,7 +337,8 @@ def _training(repo: HostRepo) -> list[str]:
 def _scripts(repo: HostRepo) -> dict[Path, str]:
     """The files of a codebase that may draw or save its model, with their text."""
     paths = [path for each in ("", "*/", "*/*/") for path in sorted(repo.root.glob(f"{each}*.py"))]
-    return {each: repo.read(each) for each in paths if each.parent.name != "scene"}
+    texts = {each: repo.read(each) for each in paths}
+    return {k: v for k, v in texts.items() if k.parent.name != "scene" or "def save" not in v}
 
 
 def _of_kernel(repo: HostRepo) -> Iterator[str]:

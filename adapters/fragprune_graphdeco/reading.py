@@ -145,7 +145,7 @@ def failing(repo: HostRepo, scripts: Collection[str]) -> list[str]:
             if any("torch.compile" in ast.unparse(each) for each in node.decorator_list)
             and any(getattr(each, "attr", "") == "backward" for each in nodes(node))
         ]
-        found += _misfits(repo, module_of(script))[:1]
+        found += [*_misfits(repo, module_of(script)), *_absent(repo, module_of(script))][:1]
     return found
 
 
@@ -193,6 +193,33 @@ def _misfits(repo: HostRepo, module: str) -> tuple[str, ...]:
         if why := _misfit(found, node, bool(owner)):
             misfits += (f"its call of {name} {why}, which fails ({at})",)
     return misfits
+
+
+def _absent(repo: HostRepo, module: str) -> Iterator[str]:
+    """Values that a script takes by name of what it drew, and that no drawing function names."""
+    tree, folder = repo.tree(module), repo.root / "gaussian_renderer"
+    modules = ["gaussian_renderer", *(f"gaussian_renderer.{p.stem}" for p in folder.glob("*.py"))]
+    said = {getattr(n, "value", "") for m in modules for n in every(repo.tree(m), ast.Constant)}
+    draws = {
+        each.asname or each.name
+        for node in every(tree, ast.ImportFrom)
+        if (node.module or "").split(".")[0] == "gaussian_renderer"
+        for each in node.names
+    }
+    called = {to: getattr(getattr(value, "func", None), "id", "") for to, value in assigned(tree)}
+    drawn = {ast.unparse(to) for to, name in called.items() if name in draws}
+    items = [n for n in by_default(repo, ("arguments", module), tree or ast.Pass()) if _key(n)]
+    said |= {_key(each) for each in items if isinstance(each.ctx, ast.Store)}  # type: ignore[attr-defined]
+    for each in items if "render" in said else ():
+        if ast.unparse(each.value) in drawn and _key(each) not in said:  # type: ignore[attr-defined]
+            at = repo.at(module, each.lineno)  # type: ignore[attr-defined]
+            yield f"reads {_key(each)} of what it drew, which no drawing function gives ({at})"
+
+
+def _key(node: ast.AST) -> str:
+    """The text by which an item is taken; "" if none is."""
+    value = getattr(node.slice, "value", None) if isinstance(node, ast.Subscript) else None
+    return value if isinstance(value, str) else ""
 
 
 @lru_cache(maxsize=64)

@@ -680,6 +680,7 @@ def test_a_result_may_be_unpacked_after_the_call(tmp_path, how):
 STATEMENT = "gaussians.thin_out(mask)"
 MORE = ('package["render"]', 'package["render"] + package["more"]')
 REFUSED = {
+    "a value that no draw gives": ({}, [MORE], "reads more of what it drew"),
     "a setting": ({"settings": ", mult=0.5"}, [], "mult, unknown"),
     "a size of its own": (
         {},

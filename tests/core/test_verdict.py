@@ -394,6 +394,13 @@ def test_what_is_never_saved_or_drawn_is_not_plain(fork, tmp_path):
     script = tmp_path / "train.py"
     script.write_text(script.read_text().replace("scene.save(", "scene.show("))
     assert "none of its scripts saves a PLY" in read_plain(repo).reasons
+    loop = tmp_path / "scene/loop.py"
+    loop.write_text("class Scene:\n    def save(self):\n        self.gaussians.save_ply(path)\n")
+    assert "none of its scripts saves a PLY" in read_plain(HostRepo(tmp_path)).reasons
+    loop.write_text("def run(scene):\n    scene.save(3)\n")
+    assert "none of its scripts saves a PLY" not in read_plain(HostRepo(tmp_path)).reasons
+    loop.unlink()
+    repo = HostRepo(tmp_path)
     (tmp_path / "gaussian_renderer/__init__.py").unlink()
     found = read_plain(HostRepo(tmp_path)).reasons[0]
     assert found.endswith("not read: no function was found that calls a rasterizer of 3DGS")

@@ -125,6 +125,15 @@ def test_a_known_kernel_that_is_never_launched_proves_nothing(tmp_path):
     assert any("exponent of alpha is -0.5*q[0]" in error for error in errors(skeleton(tmp_path)))
 
 
+def test_an_alpha_that_nothing_is_blended_by_is_of_another_kind(tmp_path):
+    vendor(tmp_path)
+    source = tmp_path / "submodules/a/cuda/triangles.cu"
+    source.write_text("float alpha = 1.0f - beta - gamma; float z = alpha * a + beta * b;\n")
+    assert not errors(skeleton(tmp_path))
+    source.write_text(f"{source.read_text()} T *= 1.0f - alpha;\n")
+    assert any("alpha = 1.0-beta-gamma: no exp()" in each for each in errors(HostRepo(tmp_path)))
+
+
 def test_a_form_multiplied_out_fits_and_is_named(tmp_path):
     """It may be the same quadratic form; only a picture tells."""
     vendor(
