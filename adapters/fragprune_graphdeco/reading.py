@@ -137,7 +137,9 @@ def failing(repo: HostRepo, scripts: Collection[str]) -> list[str]:
     ][:1]
     for script in scripts:
         tree, home = repo.tree(module_of(script)), home_of(repo, module_of(script))
-        found += [f"{script} trains the GaussianModel of {home}"] * (home not in ("", MODEL))
+        found += [f"{script} trains the GaussianModel of {home}"] * (
+            home.startswith("scene") and home != MODEL
+        )
         found += [f"{script} trains by jittor"] * ("jittor" in imported(tree))
         found += [
             f"{script} compiles {node.name}, which trains"
@@ -195,25 +197,42 @@ def _misfits(repo: HostRepo, module: str) -> tuple[str, ...]:
     return misfits
 
 
+_ANY = "any key"
+
+
 def _absent(repo: HostRepo, module: str) -> Iterator[str]:
-    """Values that a script takes by name of what it drew, and that no drawing function names."""
-    tree, folder = repo.tree(module), repo.root / "gaussian_renderer"
-    modules = ["gaussian_renderer", *(f"gaussian_renderer.{p.stem}" for p in folder.glob("*.py"))]
-    said = {getattr(n, "value", "") for m in modules for n in every(repo.tree(m), ast.Constant)}
-    draws = {
-        each.asname or each.name
+    """Values that a script takes by name of what it drew, and that the drawing does not name."""
+    tree, said = repo.tree(module), dict[str, set[str]]()
+    names = {
+        each.asname or each.name: each.name
         for node in every(tree, ast.ImportFrom)
-        if (node.module or "").split(".")[0] == "gaussian_renderer"
-        for each in node.names
+        for each in (node.names if node.module == "gaussian_renderer" else ())
     }
-    called = {to: getattr(getattr(value, "func", None), "id", "") for to, value in assigned(tree)}
-    drawn = {ast.unparse(to) for to, name in called.items() if name in draws}
+    for to, value in assigned(tree):
+        name = names.get(getattr(getattr(value, "func", None), "id", ""), "")
+        said.setdefault(ast.unparse(to), set()).update(_given(repo, name) or {_ANY})
     items = [n for n in by_default(repo, ("arguments", module), tree or ast.Pass()) if _key(n)]
-    said |= {_key(each) for each in items if isinstance(each.ctx, ast.Store)}  # type: ignore[attr-defined]
-    for each in items if "render" in said else ():
-        if ast.unparse(each.value) in drawn and _key(each) not in said:  # type: ignore[attr-defined]
-            at = repo.at(module, each.lineno)  # type: ignore[attr-defined]
-            yield f"reads {_key(each)} of what it drew, which no drawing function gives ({at})"
+    own = {_key(each) for each in items if isinstance(getattr(each, "ctx", None), ast.Store)}
+    for each in (each for each in items if isinstance(each, ast.Subscript)):
+        known = said.get(ast.unparse(each.value), {_ANY}) | own
+        if _ANY not in known and _key(each) not in known:
+            at = repo.at(module, each.lineno)
+            yield f"reads {_key(each)} of what it drew, which has no such value ({at})"
+
+
+def _given(repo: HostRepo, name: str) -> set[str]:
+    """Texts in a drawing function, the keys of its dict among them; empty if it may add others."""
+    body = repo.function("gaussian_renderer", name) if name else None
+    pairs = list(assigned(body))
+    named = {ast.unparse(node.value) for node in every(body, ast.Return) if node.value}
+    made = [value for to, value in pairs if ast.unparse(to) in named]
+    made += [node.value for node in every(body, ast.Return) if isinstance(node.value, ast.Dict)]
+    for node in every(body, ast.Call):
+        owner, _, method = ast.unparse(node.func).rpartition(".")
+        made += node.args if owner in named and method == "update" else []
+    texts = {str(each.value) for each in every(body, ast.Constant)}
+    dicts = [each for each in made if isinstance(each, ast.Dict) and None not in each.keys]
+    return texts if "render" in texts and dicts and len(dicts) == len(made) else set()
 
 
 def _key(node: ast.AST) -> str:
