@@ -211,6 +211,8 @@ def _absent(repo: HostRepo, module: str) -> Iterator[str]:
     for to, value in assigned(tree):
         name = names.get(getattr(getattr(value, "func", None), "id", ""), "")
         said.setdefault(ast.unparse(to), set()).update(_given(repo, name) or {_ANY})
+    for node in every(tree, ast.Call):  # what a script adds by another way than an item
+        said.setdefault(ast.unparse(node.func).removesuffix(".update"), set()).add(_ANY)
     items = [n for n in by_default(repo, ("arguments", module), tree or ast.Pass()) if _key(n)]
     own = {_key(each) for each in items if isinstance(getattr(each, "ctx", None), ast.Store)}
     for each in (each for each in items if isinstance(each, ast.Subscript)):

@@ -911,6 +911,10 @@ CALLED = {
         "\n\ndef training(",
         "\n\ndef start():\n    gaussians = Bound()\n    gaussians.bind()\n\n\ndef training(",
     ),
+    "of a value that a script adds": (
+        '        loss = l1_loss(package["render"]',
+        '        package.update(extra)\n        loss = l1_loss(package["extra"]',
+    ),
     "of another function of this name": (
         "    for iteration in",
         "    def l1_loss(a): ...\n    l1_loss(1, 2)\n    for iteration in",
