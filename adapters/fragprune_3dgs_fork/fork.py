@@ -174,18 +174,18 @@ class Fork:
     def optional(self) -> dict[ast.AST, frozenset[str]]:
         """What scripts do only under options that are off by default, with their names.
 
-        Without those that a script itself sets, as all may be from a file.
+        Without those that the checkout itself sets, as all may be from a file.
         """
-        own = [self.tree(each) for each in self.scripts]
-        made = {
-            to.attr for each in own for to, _ in assigned(each) if isinstance(to, ast.Attribute)
-        }
+        modules = ("arguments", *map(reading.module_of, self.scripts))
+        own = [tree for name, tree in self.trees.items() if name.split(".")[0] != "arguments"]
+        pairs = [pair for each in own for pair in assigned(each)]
+        made = {to.attr for to, _ in pairs if isinstance(to, ast.Attribute)}
         found: dict[ast.AST, frozenset[str]] = {}
-        if any("setattr(" in ast.unparse(each) for each in own):
+        if any("setattr(" in ast.unparse(self.tree(each)) for each in self.scripts):
             return found
         for node in (node for tree in self.trees.values() for node in every(tree, ast.If)):
-            taken = reading.decided(self.repo, self.options_in, node.test)
-            options = reading.options_of(self.repo, self.options_in, node.test)
+            taken = reading.decided(self.repo, modules, node.test)
+            options = reading.options_of(self.repo, modules, node.test)
             if taken is not None and made.isdisjoint(options):
                 skipped = node.orelse if taken else node.body
                 found |= {inner: options for each in skipped for inner in nodes(each)}
@@ -356,12 +356,13 @@ def _trainings(fork: Fork, module: str) -> tuple[str, str] | None:
     functions = {each.name: each for each in body if isinstance(each, ast.FunctionDef)}
     training, several = set[str](), list[str]()
 
-    def passes(node: ast.AST, looped: bool = False) -> int:
-        if node in fork.optional:
-            fork.options |= fork.optional[node] if "backward(" in ast.unparse(node) else set()
+    def passes(node: ast.AST, looped: bool = False, asked: bool = False) -> int:
+        if node in fork.optional and not asked:
+            fork.options |= fork.optional[node] if passes(node, looped, True) else set()
             return 0
         if isinstance(node, ast.If):
-            return max(sum(passes(each, looped) for each in b) for b in (node.body, node.orelse))
+            branches = (node.body, node.orelse)
+            return max(sum(passes(each, looped, asked) for each in b) for b in branches)
         own = 0
         if isinstance(node, ast.Call):
             called = getattr(node.func, "id", "")
@@ -370,7 +371,7 @@ def _trainings(fork: Fork, module: str) -> tuple[str, str] | None:
                 several.append(called)
                 own += 1
         looped |= _is_loop(node)
-        return own + sum(passes(each, looped) for each in ast.iter_child_nodes(node))
+        return own + sum(passes(each, looped, asked) for each in ast.iter_child_nodes(node))
 
     while found := {k for k, each in functions.items() if k not in training and passes(each)}:
         training |= found

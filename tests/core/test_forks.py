@@ -939,7 +939,10 @@ CHANGES = {
     "a change": "gaussians._opacity.data.clamp_(0)",
     "a result": "kept = gaussians.thin_out(mask)",
     "another step": "loss.backward()",
+    "another training": "refine(gaussians)",
 }
+REFINES = "\n\ndef refine(gaussians):\n    for i in range(9):\n        loss.backward()\n"
+GROWN = "    def __init__(self, sh_degree):\n        self.grown = False"
 MORE_FLAGS = (
     "\nparser.add_argument('--late', default=0.0)\nparser.add_argument('--end', default=9)\n"
 )
@@ -947,6 +950,7 @@ TESTS = {
     "off": ("opt.late > 0 and iteration < opt.end", "", True),
     "asked for in another way": ('getattr(opt, "late", 0.0)', "", True),
     "on": ("opt.end > 0", "", False),
+    "of the model": ("gaussians.grown", "", False),
     "set by the script": ("opt.late > 0", "\nopt.late = 1\n", False),
     "set from a file": ("opt.late > 0", "\nsetattr(opt, name, value)\n", False),
 }
@@ -959,7 +963,8 @@ def test_what_an_option_changes_is_not_changed_without_it(tmp_path, test, what):
     repo = fork(
         tmp_path,
         ("\n        loss.backward()", ASKS.format(condition, CHANGES[what])),
-        ("\ndef read_flags", f"{MORE_FLAGS}{beside}\ndef read_flags"),
+        ("\ndef read_flags", f"{MORE_FLAGS}{beside}{REFINES}\ndef read_flags"),
+        ("    def __init__(self, sh_degree): ...", GROWN),
     )
     if not served:
         assert errors(repo)
