@@ -275,7 +275,7 @@ def test_a_value_by_which_a_host_densifies_is_not_read_in_stage_2(tmp_path, wher
     repo = fork(tmp_path / "early", *EARLY[where], values="image, radii, hits", kernel=";")
     assert errors(repo) == []
     warned = [each.found for each in ForkAdapter().match(repo).findings]
-    assert "hits, by which it densifies" in warned
+    assert "hits, by which it densifies and which only its own rasterizer gives" in warned
     assert read_fork(repo).outputs[PACKAGE][2].role == "unread"
     use = '        print(package["hits"])\n' if where == "in the branch" else "        scores()\n"
     later = (STEPS, f"{use}{STEPS}")
