@@ -426,9 +426,12 @@ class ForkAdapter(GraphdecoAdapter):
         Raises:
             UsageError: these, or an option under which it draws or changes its model otherwise.
         """
-        given = {word.partition("=")[0] for word in arguments}
+        parser = ArgumentParser(add_help=False, allow_abbrev=False)
         for name in read_fork(repo).options:
-            if f"--{name}" in given:
+            parser.add_argument(f"--{name}", nargs="?", const="", action="append")
+        given = vars(parser.parse_known_args(arguments)[0])
+        for name, values in ((name, values) for name, values in given.items() if values):
+            if any(value != read_fork(repo).default(name) for value in values):
                 raise UsageError(
                     f"--{name}",
                     "other draws, other values of the rasterizer, or other changes of the model",

@@ -134,6 +134,13 @@ class Fork:
         """The tree of a script."""
         return self.repo.tree(reading.module_of(script)) or ast.Module([], [])
 
+    def default(self, option: str) -> str | None:
+        """An option's default, as a command gives it; None if it is not known."""
+        modules = ("arguments", *map(reading.module_of, self.scripts))
+        given = [e for each in modules for e in reading.defaults(self.repo, each, option)]
+        same = {str(getattr(each, "value", None)) for each in given}
+        return same.pop() if len(same) == 1 else None
+
     def is_off(self, name: str) -> bool:
         """Whether an option or an attribute of the model is None or False by default."""
         given = [e for each in self.options_in for e in reading.defaults(self.repo, each, name)]

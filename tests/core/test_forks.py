@@ -971,8 +971,10 @@ def test_what_an_option_changes_is_not_changed_without_it(tmp_path, test, what):
         return
     assert errors(repo) == []
     ForkAdapter().refuse(repo, ["--end", "5"], stage="auto", device="cuda")
-    with pytest.raises(UsageError, match="--late"):
-        ForkAdapter().refuse(repo, ["--late", "1"], stage="auto", device="cuda")
+    ForkAdapter().refuse(repo, ["--late", "0.0"], stage="auto", device="cuda")
+    for words in (["--late", "1"], ["--late=1"], ["--late"]):
+        with pytest.raises(UsageError, match="--late"):
+            ForkAdapter().refuse(repo, words, stage="auto", device="cuda")
 
 
 def test_the_model_that_the_scene_exports_is_the_one_that_is_read(tmp_path):
