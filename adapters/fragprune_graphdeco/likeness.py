@@ -275,7 +275,7 @@ def chart(arguments: Mapping[str, Tensor], view: View) -> dict[str, Tensor]:
     wide, beyond, kind = number < 40, (number >= 40) & (number < 44), number % 16
     depths, opacities = uniform(1.5, 6.0), uniform(0.02, 0.6)
     depths = depths.where(kind != 0, uniform(0.1, 0.3)).where(kind != 1, uniform(-2.0, -1.0))
-    depths = depths.where(~wide, uniform(7.0, 9.0)).where(~beyond, 3.0)
+    depths = depths.where(~wide, uniform(7.0, 9.0)).where(~beyond, 3.0 + 0.1 * (number - 40))
     opacities = opacities.where(~wide & (kind != 2), 0.9995)
     pixels = torch.exp(uniform(math.log(0.3), math.log(6.0)))  # standard deviations
     pixels = pixels.where(~wide, view.width / 12).where(~beyond, view.width / 8)
@@ -304,6 +304,9 @@ def chart(arguments: Mapping[str, Tensor], view: View) -> dict[str, Tensor]:
     filled = {}
     for name, own in arguments.items():
         new = made.get(name)
+        if new is None and own.is_floating_point() and own[0].numel() > 2 and own.any():
+            new = uniform(0.5, 1.5, *own.shape[1:])  # channels, of which a host may make ratios,
+            new.reshape(count, -1)[:, 2] *= 4  # as of a normal that faces the camera
         if new is None or any(a < b for a, b in zip(new.shape[1:], own.shape[1:], strict=False)):
             filled[name] = own.detach()[rows % len(own)]
         else:

@@ -2,6 +2,7 @@
 
 from collections import namedtuple
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ import torch
 
 from fragprune_3dgs_fork import ForkDialect
 from fragprune_3dgs_fork.fork import Fork, Output
-from fragprune_graphdeco import proof
+from fragprune_graphdeco import likeness, proof
 from fragprune_plugins.adapting import EngineError, HostCall, HostRepo
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.injection.rasterizing import further_picture
@@ -223,3 +224,21 @@ def test_only_the_first_picture_of_a_view_in_a_step_is_pressed():
         assert not further_picture(state, 5, 0)
     state.steps = 2
     assert not further_picture(state, 5, 0)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_no_last_bit_decides_what_a_proofs_chart_looks_like(seed):
+    """Two engines that round otherwise draw it alike, through any camera."""
+    found = scenes.random_scene(seed, 40)
+    channels = torch.rand(40, 5, generator=torch.Generator().manual_seed(seed))
+    dialect, call = replace(DIALECT, fork=PLANES), call_of(found, channels, asked=True)
+    own = {name: each for name, each in call.arguments.items() if len(each) == 40}
+    filled = {**call.arguments, **likeness.chart(own, found.view)}
+    drawn = []
+    for engine in map(create_engine, ("reference", "cpu")):
+        charted = replace(call, arguments=filled)
+        draw = partial(engine.rasterize, thresholds=None)
+        drawn.append(dialect.answer(charted, dialect.unpack(charted), draw))
+    assert [likeness.difference(*each) for each in zip(*drawn, strict=True)] == [""] * 4
+    depths = filled["means3D"].double() @ found.view.viewmatrix[:3, 2].double()
+    assert depths.sort().values.diff().min() > 1e-5  # of 9, in which float32 is 1e-6 apart
