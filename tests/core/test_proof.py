@@ -105,6 +105,18 @@ def test_outputs_are_told_by_their_numbers(host, difference):
     assert f"render ({RENDERER}:" in proved.call
 
 
+def test_black_points_lie_where_colours_are_cut_and_do_not_hinder_a_proof(host):
+    """Their harmonics give 0 but for rounding, on either side of the cut."""
+    with running(host("none")) as started:
+        model = started.model(40, setup=False)
+        with torch.no_grad():
+            model._features_dc.copy_(torch.tensor(-0.5) / 0.28209479177387814)
+            model._features_rest.zero_()
+        started.render(started.camera(96, 64), model)
+        (proved,) = started.session.proofs.values()
+    assert proved.outputs == EQUAL["none"]
+
+
 @pytest.mark.parametrize("difference", OTHERWISE)
 def test_a_rasterizer_that_draws_otherwise_is_refused(host, difference):
     with pytest.raises(ProofError) as refused:
