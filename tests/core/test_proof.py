@@ -133,6 +133,16 @@ def test_the_gradient_on_the_screen_matters_only_where_ours_draws_for_densificat
     assert proved.outputs[0].startswith("the picture, with another gradient on the screen")
 
 
+def test_a_kept_proof_is_of_what_proved_it(host, monkeypatch):
+    folder, proved = host("none"), []
+    prove = RasterizerProver.prove
+    monkeypatch.setattr(RasterizerProver, "prove", lambda *each: proved.append(1) or prove(*each))
+    for own in ("as it is", "as it is", "mended"):
+        monkeypatch.setattr("fragprune_graphdeco.proof._OWN", own)
+        draw(folder)
+    assert len(proved) == 2
+
+
 def test_every_difference_is_tried():
     assert {*EQUAL, *OTHERWISE, "scale modifier", "no background"} == DIFFERENCES.keys()
 
