@@ -8,6 +8,7 @@ from miniatures.forks import RENDER, fork
 
 from fragprune_3dgs_fork import ForkAdapter, Unread
 from fragprune_3dgs_fork.fork import read_fork
+from fragprune_graphdeco import plain
 from fragprune_plugins.adapting import EngineError, HostCall, NotComparedError, Role, UsageError
 from fragprune_plugins.hosts.choosing import attempt, choose
 from fragprune_plugins.hosts.source import HostRepo
@@ -223,6 +224,11 @@ if (with_maps) {
 PLANES = {
     "as PGSR's": ("", "", ""),
     "a nested block": ("{\n    for", "{ if (near) { }\n    for", "with_maps, unknown"),
+    "one nested block": (
+        "        M[ch] +=",
+        "        if (near) { } M[ch] +=",
+        "with_maps, unknown",
+    ),
     "a block that skips": ("{\n    for", "{ continue;\n    for", "with_maps, unknown"),
     "a block that dims": ("{\n    for", "{ T = 0;\n    for", "with_maps, unknown"),
     "a block that paints": ("{\n    for", "{ out_color[0] = 1;\n    for", "with_maps, unknown"),
@@ -987,6 +993,7 @@ def test_the_model_that_the_scene_exports_is_the_one_that_is_read(tmp_path):
     scene.write_text(f"from scene.late_model import GaussianModel\n{scene.read_text()}")
     repo = HostRepo(tmp_path)
     assert "its opacity_activation is torch.tanh (scene/late_model.py" in errors(repo)[0]
+    assert plain.read_plain(repo).elsewhere == "GaussianModel is in scene.late_model"
     (tmp_path / "scene/late_model.py").write_text(other.replace("torch.tanh", "torch.sigmoid"))
     assert "train.py trains the GaussianModel of scene.late_model" in errors(HostRepo(tmp_path))[0]
 
