@@ -48,6 +48,9 @@ _OPTIMIZER = re.compile(r"(torch\.)?(optim\.)?\w*(Adam|SGD|RMSprop)\w*\(")
 _CAMERA = re.compile(r"view|cam")
 _MODEL_ARGUMENTS = ("pc", "gaussians", "gaussian", "model")
 
+_SET = {"iterations", "save_iterations", "checkpoint_iterations", "start_checkpoint", "model_path"}
+"""Options that a run sets itself, whatever their defaults."""
+
 NEUTRAL = {"antialiasing", "confidence", "projmatrix_raw"}
 """Further settings that the engines know, or that are checked to be neutral at every call."""
 HANDED = ("detach", "clone", "contiguous", "squeeze", "unsqueeze")
@@ -128,7 +131,12 @@ class Fork:
     @property
     def options_in(self) -> tuple[str, ...]:
         """The modules that give options and attributes of the model their defaults."""
-        return ("arguments", MODEL, *map(reading.module_of, self.scripts))
+        return (MODEL, *self.command)
+
+    @property
+    def command(self) -> tuple[str, ...]:
+        """The modules that give the options of the command their defaults."""
+        return ("arguments", *map(reading.module_of, self.scripts))
 
     def tree(self, script: str) -> ast.Module:
         """The tree of a script."""
@@ -136,10 +144,8 @@ class Fork:
 
     def default(self, option: str) -> str | None:
         """An option's default, as a command gives it; None if it is not known."""
-        modules = ("arguments", *map(reading.module_of, self.scripts))
-        given = [e for each in modules for e in reading.defaults(self.repo, each, option)]
-        same = {str(getattr(each, "value", None)) for each in given}
-        return same.pop() if len(same) == 1 else None
+        known = reading.by_default_of(self.repo, self.command, option)
+        return str(known[0]) if known else None
 
     def is_off(self, name: str) -> bool:
         """Whether an option or an attribute of the model is None or False by default."""
@@ -181,18 +187,17 @@ class Fork:
     def optional(self) -> dict[ast.AST, frozenset[str]]:
         """What scripts do only under options that are off by default, with their names.
 
-        Without those that the checkout itself sets, as all may be from a file.
+        Without those that a run sets, or the checkout itself, as it may all of them from a file.
         """
-        modules = ("arguments", *map(reading.module_of, self.scripts))
         own = [tree for name, tree in self.trees.items() if name.split(".")[0] != "arguments"]
         pairs = [pair for each in own for pair in assigned(each)]
-        made = {to.attr for to, _ in pairs if isinstance(to, ast.Attribute)}
+        made = _SET | {to.attr for to, _ in pairs if isinstance(to, ast.Attribute)}
         found: dict[ast.AST, frozenset[str]] = {}
         if any("setattr(" in ast.unparse(self.tree(each)) for each in self.scripts):
             return found
         for node in (node for tree in self.trees.values() for node in every(tree, ast.If)):
-            taken = reading.decided(self.repo, modules, node.test)
-            options = reading.options_of(self.repo, modules, node.test)
+            taken = reading.decided(self.repo, self.command, node.test)
+            options = reading.options_of(self.repo, self.command, node.test)
             if taken is not None and made.isdisjoint(options):
                 skipped = node.orelse if taken else node.body
                 found |= {inner: options for each in skipped for inner in nodes(each)}

@@ -147,10 +147,11 @@ def failing(repo: HostRepo, scripts: Collection[str]) -> list[str]:
             if any("torch.compile" in ast.unparse(each) for each in node.decorator_list)
             and any(getattr(each, "attr", "") == "backward" for each in nodes(node))
         ]
-        found += [*_misfits(repo, module_of(script)), *_absent(repo, module_of(script))][:1]
+        found += (_misfits(repo, module_of(script)) + _absent(repo, module_of(script)))[:1]
     return found
 
 
+@lru_cache(maxsize=64)
 def home_of(repo: HostRepo, module: str) -> str:
     """The module of the checkout that defines what a module calls GaussianModel; "" if unknown."""
     return _definition(repo, module, "GaussianModel")[0]
@@ -200,9 +201,10 @@ def _misfits(repo: HostRepo, module: str) -> tuple[str, ...]:
 _ANY = "any key"
 
 
-def _absent(repo: HostRepo, module: str) -> Iterator[str]:
+@lru_cache(maxsize=64)  # of the adapters, many ask
+def _absent(repo: HostRepo, module: str) -> tuple[str, ...]:
     """Values that a script takes by name of what it drew, and that the drawing does not name."""
-    tree, said = repo.tree(module), dict[str, set[str]]()
+    tree, said, absent = repo.tree(module), dict[str, set[str]](), tuple[str, ...]()
     names = {
         each.asname or each.name: each.name
         for node in every(tree, ast.ImportFrom)
@@ -219,7 +221,8 @@ def _absent(repo: HostRepo, module: str) -> Iterator[str]:
         known = said.get(ast.unparse(each.value), {_ANY}) | own
         if _ANY not in known and _key(each) not in known:
             at = repo.at(module, each.lineno)
-            yield f"reads {_key(each)} of what it drew, which has no such value ({at})"
+            absent += (f"reads {_key(each)} of what it drew, which has no such value ({at})",)
+    return absent
 
 
 def _given(repo: HostRepo, name: str) -> set[str]:
@@ -354,7 +357,16 @@ def _option(node: ast.AST) -> str:
 def _by_itself(repo: HostRepo, modules: Collection[str], node: ast.AST) -> list[Any]:
     """The one value of a constant, or of an option by default; [] if it is not known."""
     option = _option(node)
-    given = [v for m in modules for v in defaults(repo, m, option)] if option else [node]
+    return by_default_of(repo, modules, option) if option else _one([node])
+
+
+def by_default_of(repo: HostRepo, modules: Collection[str], option: str) -> list[Any]:
+    """The one value that modules give an option by default; [] if it is not known."""
+    return _one([value for module in modules for value in defaults(repo, module, option)])
+
+
+def _one(given: list[Any]) -> list[Any]:
+    """The value of expressions that are one and the same constant; [] if they are not."""
     try:
         values = [ast.literal_eval(each) for each in given]
     except (ValueError, TypeError, SyntaxError):

@@ -950,13 +950,15 @@ CHANGES = {
 REFINES = "\n\ndef refine(gaussians):\n    for i in range(9):\n        loss.backward()\n"
 GROWN = "    def __init__(self, sh_degree):\n        self.grown = False"
 MORE_FLAGS = (
-    "\nparser.add_argument('--late', default=0.0)\nparser.add_argument('--end', default=9)\n"
+    "\nparser.add_argument('--late', default=0.0)\nparser.add_argument('--end', default=9)"
+    "\nparser.add_argument('--start_checkpoint', default=None)\n"
 )
 TESTS = {
     "off": ("opt.late > 0 and iteration < opt.end", "", True),
     "asked for in another way": ('getattr(opt, "late", 0.0)', "", True),
     "on": ("opt.end > 0", "", False),
     "of the model": ("gaussians.grown", "", False),
+    "set by a run": ("opt.start_checkpoint", "", False),
     "set by the script": ("opt.late > 0", "\nopt.late = 1\n", False),
     "set from a file": ("opt.late > 0", "\nsetattr(opt, name, value)\n", False),
 }
