@@ -195,6 +195,7 @@ class GaussianSplatting(GraphdecoAdapter):
             resume=("-l", "--load_ply"),
             default_iterations=30_000,
             restarts=True,
+            in_full=super().command_line(repo).in_full,
         )
 
     def photographs(self, repo: HostRepo, arguments: list[str]) -> NoReturn:

@@ -7,6 +7,7 @@ import contextlib
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType, ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -20,6 +21,7 @@ from fragprune_graphdeco.reading import (
     entries,
     every,
     failing,
+    in_full,
     made_models,
     module_of,
     read_flags,
@@ -407,6 +409,7 @@ class GraphdecoAdapter(ScriptAdapter):
             images=("-i", "--images"),
             white_background=("-w", "--white_background"),
             hold_out=("--eval",),
+            in_full=partial(in_full, repo),
         )
         return replace(line, **self.flags)
 

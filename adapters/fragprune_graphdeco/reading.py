@@ -9,6 +9,7 @@ import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from functools import lru_cache
+from pathlib import Path
 from typing import Any, TypeVar
 
 from fragprune_plugins.adapting import (
@@ -16,6 +17,7 @@ from fragprune_plugins.adapting import (
     Finding,
     Function,
     HostRepo,
+    UsageError,
     imported,
     is_off,
     nodes,
@@ -536,10 +538,35 @@ def read_flags(repo: HostRepo, line: CommandLine) -> list[Finding]:
     ]
 
 
-def _strings(tree: ast.Module) -> Iterator[str]:
+def in_full(repo: HostRepo, script: Path, arguments: list[str]) -> list[str]:
+    """Arguments in which the beginning of a long flag is written out, as argparse completes it.
+
+    A flag is what looks like one in the script and in what it imports of its checkout, and what
+    groups make. Those of a script that lies elsewhere are unknown.
+
+    Raises:
+        UsageError: several flags begin so.
+    """
+    if not script.resolve().is_relative_to(repo.root):
+        return arguments
+    module = module_of(script.resolve().relative_to(repo.root).as_posix())
+    trees = [repo.tree(module)] if repo.package else reached(repo, [module]).values()
+    flags = {*_of_groups(repo), *(each for tree in trees for each in _strings(tree))}
+    whole = []
+    for word in arguments:
+        name, *value = word.split("=", 1)
+        begun = sorted(each for each in flags if name[:2] == "--" and each.startswith(name))
+        if len(begun) > 1 and name not in begun and name != "--":
+            expected = f"one of {', '.join(begun)}"
+            raise UsageError(name, "an abbreviation of several flags", expected, "Write it out.")
+        whole.append("=".join([begun[0] if len(begun) == 1 else name, *value]))
+    return whole
+
+
+def _strings(tree: ast.Module | None) -> Iterator[str]:
     """Strings in a script that could be flags."""
     for node in every(tree, ast.Constant):
-        if isinstance(node.value, str) and node.value.startswith("-"):
+        if isinstance(node.value, str) and re.fullmatch(r"--?\w[\w-]*", node.value):
             yield node.value
 
 
@@ -550,7 +577,7 @@ def _of_groups(repo: HostRepo) -> Iterator[str]:
     """
     for path in sorted((repo.root / "arguments").glob("*.py")):
         tree = repo.tree(f"arguments.{path.stem}") if path.stem != "__init__" else None
-        yield from _strings(tree) if tree else ()
+        yield from _strings(tree)
     for each, _ in assigned(repo.tree("arguments")):
         if isinstance(each, ast.Attribute) and ast.unparse(each.value) == "self":
             yield f"--{each.attr.removeprefix('_')}"

@@ -165,6 +165,7 @@ class CommandLine:
         hold_out: flags that make the host hold views out; () if it always does.
         one_run: the host cannot resume a training, and ``resume`` names a model to evaluate.
             Stage 2 follows stage 1 in one run; see ``ScriptAdapter.lengthened``.
+        in_full: a script's arguments with abbreviated flags written out; by default the same.
     """
 
     scripts: tuple[str, ...]
@@ -185,6 +186,7 @@ class CommandLine:
     white_background: tuple[str, ...] = ()
     hold_out: tuple[str, ...] = ()
     one_run: bool = False
+    in_full: Callable[[Path, list[str]], list[str]] = lambda script, arguments: arguments
 
     def spellings(self, field: str) -> tuple[str, ...]:
         """All spellings of a flag; the last one is the one to use."""
@@ -199,7 +201,7 @@ class CommandLine:
         Raises:
             UsageError: a flag lacks its value, or the configuration file cannot be read.
         """
-        parser = Flags(add_help=False, conflict_handler="resolve")
+        parser = Flags(add_help=False, allow_abbrev=False, conflict_handler="resolve")
         options: dict[str, dict[str, Any]] = {
             "resolution": {"type": int},
             "images": {},

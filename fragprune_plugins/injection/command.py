@@ -24,7 +24,7 @@ class HostCommand:
     """The parts of a host's command. The host itself parses all of its flags.
 
     Attributes:
-        arguments: the script's arguments, unchanged.
+        arguments: the script's arguments, with abbreviated flags written out.
         line: the host's spellings of the flags that fragprune reads.
         module: the module's name in ``python -m module``; "" for a script.
         flags: values of these flags, by field of ``CommandLine``.
@@ -39,6 +39,7 @@ class HostCommand:
     module: str = ""
 
     def __post_init__(self) -> None:
+        self.arguments = self.line.in_full(self.script, self.arguments)
         self.flags = self.line.read(self.arguments)
 
     def of(self, script: Path, arguments: list[str]) -> HostCommand:
@@ -142,10 +143,7 @@ def _without_options(words: list[str]) -> list[str]:
 
 
 def _script_of(module: str) -> Path:
-    """The file that ``python -m module`` runs, found without importing it.
-
-    The current folder goes before installed packages.
-    """
+    """The file that ``python -m module`` runs: this folder's, or else an installed package's."""
     for repo in (HostRepo(Path.cwd()), HostRepo.installed(module.split(".")[0])):
         script = repo.path(module) if repo else None
         if script is not None and script.name == "__init__.py":

@@ -12,6 +12,7 @@ from fragprune_graphdeco import plain
 from fragprune_plugins.adapting import EngineError, HostCall, NotComparedError, Role, UsageError
 from fragprune_plugins.hosts.choosing import attempt, choose
 from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.workbench.check.work import judge
 
@@ -980,9 +981,28 @@ def test_what_an_option_changes_is_not_changed_without_it(tmp_path, test, what):
     assert errors(repo) == []
     ForkAdapter().refuse(repo, ["--end", "5"], stage="auto", device="cuda")
     ForkAdapter().refuse(repo, ["--late", "0.0"], stage="auto", device="cuda")
-    for words in (["--late", "1"], ["--late=1"], ["--late"]):
+    for words in (["--late", "1"], ["--late=1"], ["--late"], ["--lat", "1"], ["--lat=1"]):
         with pytest.raises(UsageError, match="--late"):
-            ForkAdapter().refuse(repo, words, stage="auto", device="cuda")
+            run([str(tmp_path / "train.py"), *words], RunOptions(device="cpu"))
+
+
+BEGINNINGS = {
+    ("--iter", "7", "-m", "out"): ["--iterations", "7", "-m", "out"],
+    ("--iter=7", "--", "--lat"): ["--iterations=7", "--", "--late"],
+    ("--model", "gs", "--other=1"): ["--model", "gs", "--other=1"],
+}
+
+
+@pytest.mark.parametrize("words", BEGINNINGS)
+def test_flags_are_written_out_as_argparse_completes_them(tmp_path, words):
+    (tmp_path / "beside.py").write_text("def own(parser):\n    parser.add_argument('--model')\n")
+    given = f"import beside{MORE_FLAGS}parser.add_argument('--iterations')\n"
+    given += "parser.add_argument('--sparse')"
+    fork(tmp_path, ("\ndef read_flags", f"\n{given}\n\ndef read_flags"))
+    in_full = partial(ForkAdapter().command_line(HostRepo(tmp_path)).in_full, tmp_path / "train.py")
+    assert in_full([*words]) == BEGINNINGS[words]
+    with pytest.raises(UsageError, match="--sparse, --start_checkpoint"):
+        in_full(["--s"])
 
 
 def test_the_model_that_the_scene_exports_is_the_one_that_is_read(tmp_path):

@@ -46,7 +46,7 @@ def host(tmp_path):
 
 def parsed(repo, *arguments):
     line = Vanilla3DGS().command_line(repo)
-    return HostCommand(Path("train.py"), list(map(str, arguments)), line)
+    return HostCommand(repo.root / "train.py", list(map(str, arguments)), line)
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_any_spelling_of_a_flag_is_read_and_the_last_is_written(tmp_path):
         iterations=("-i", "--iteration"),
         resume=("-l", "--load_ply"),
     )
-    host = HostCommand(Path("train.py"), ["-i", "7", "-l", "a.ply"], line)
+    host = HostCommand(tmp_path / "train.py", ["-i", "7", "-l", "a.ply"], line)
     assert (host.flags.iterations, host.flags.resume) == (7, "a.ply")
     written = [line.spellings(field)[-1] for field in ("iterations", "output", "resume")]
     assert written == ["--iteration", "--model_path", "--load_ply"]
