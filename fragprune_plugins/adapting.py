@@ -7,8 +7,8 @@ its seams   Seam, Role, SeamCall, RowTrace, revised
 drawing     Dialect, HostCall; RasterInputs and its parts, RasterOutputs
 a proof     Prover, Proof, Place
 its script  CommandLine, ConfigFile, Photographs, Resolution
-files       Door, for those that a host reads; replacing, for those that we write; Model, read_ply,
-            thresholds_of
+files       UntrustedFile, for those that a host reads; replacing, for those that we write;
+            Model, read_ply, thresholds_of
 settings    parse_goal
 a plugin    hookimpl
 errors      each with where, found, expected and remedy
@@ -39,7 +39,7 @@ from fragprune_plugins.errors import Terminated as Terminated
 from fragprune_plugins.errors import UsageError as UsageError
 from fragprune_plugins.files.atomic import replacing as replacing
 from fragprune_plugins.files.columns import change_of as change_of
-from fragprune_plugins.files.reading import Door as Door
+from fragprune_plugins.files.reading import UntrustedFile as UntrustedFile
 from fragprune_plugins.hosts.adapter import CHECKPOINT_KEY as CHECKPOINT_KEY
 from fragprune_plugins.hosts.adapter import GROUPS as GROUPS
 from fragprune_plugins.hosts.adapter import CommandLine as CommandLine

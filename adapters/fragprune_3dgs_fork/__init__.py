@@ -59,7 +59,7 @@ log = logging.getLogger("fragprune")
 
 
 @cache
-def tell_once(what: str) -> None:
+def warn_once(what: str) -> None:
     """Warn of something once."""
     log.warning("%s", what)
 
@@ -153,12 +153,12 @@ class ForkDialect(GraphdecoDialect):
         if not call.still and call["means2D"].shape[1] > SCREEN:
             self._refuse("means2D", "absolute screen gradients", "three columns, or stage 2")
         if not call.still and fork.scaled:
-            tell_once(
+            warn_once(
                 f"{', '.join(sorted(fork.scaled))}: the gradient on the screen is not changed by "
                 "it here, so other Gaussians are densified than by the host's own rasterizer"
             )
         if not call.still and fork.screens:
-            tell_once(
+            warn_once(
                 f"{', '.join(sorted(fork.screens))}: gets no gradient here, and a densification "
                 "that reads it fails; only the host's own rasterizer computes it"
             )

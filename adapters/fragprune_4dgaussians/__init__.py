@@ -20,7 +20,6 @@ from typing import Any
 from fragprune_4dgaussians.config import PythonFile
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall, model_seam
 from fragprune_plugins.adapting import (
-    Door,
     HostCall,
     HostInfo,
     ModelFileError,
@@ -28,6 +27,7 @@ from fragprune_plugins.adapting import (
     RasterInputs,
     Role,
     SeamCall,
+    UntrustedFile,
     UsageError,
     revised,
 )
@@ -38,7 +38,7 @@ OUTPUTS = 3
 STATE = 12
 """The place of the optimizer's state in a checkpoint."""
 
-_NETWORK = Door(
+_NETWORK = UntrustedFile(
     ModelFileError,
     "not readable as a part of the model",
     "deformation.pth and deformation_table.pth, which the host writes beside a PLY",
@@ -50,7 +50,7 @@ _NETWORK = Door(
 class MovingDialect(GraphdecoDialect):
     """Vanilla's call of 2023 with depth."""
 
-    spares = {"open3d": {}, "lpips": {}, "tkinter": {"W": "w"}}  # not used to train or draw
+    unneeded = {"open3d": {}, "lpips": {}, "tkinter": {"W": "w"}}  # not used to train or draw
     returned = ("image", "radii", "depth")
 
     def unpack(self, call: HostCall) -> RasterInputs:

@@ -43,7 +43,7 @@ SILENT = {"wandb": {"init": lambda **_: NO_SWEEP, "define_metric": _nothing, "lo
 class LP3DGSDialect(GraphdecoDialect):
     """Vanilla's call of 2023, and its form that sums blending weights."""
 
-    spares = SILENT
+    unneeded = SILENT
 
     def unpack(self, call: HostCall) -> RasterInputs:
         """Translate the call.

@@ -35,7 +35,7 @@ KERNEL_SIZE = 0.1
 class MipDialect(GraphdecoDialect):
     """Vanilla's call of 2023 with the 2D filter's size and a sampling offset for each pixel."""
 
-    spares = {"open3d": {}, "cv2": {}}  # imported and never used
+    unneeded = {"open3d": {}, "cv2": {}}  # imported and never used
 
     def unpack(self, call: HostCall) -> RasterInputs:
         """Translate the call; densification reads an absolute third column of the gradient."""

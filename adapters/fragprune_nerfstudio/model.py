@@ -34,9 +34,9 @@ from fragprune_plugins.adapting import (
 )
 from fragprune_plugins.injection.process import checkpoint_values
 from fragprune_plugins.injection.session import Session, active_session
+from fragprune_plugins.learning.deferred import between_steps
 from fragprune_plugins.learning.interruption import EXIT_CODE, Terminate, sigterm_interrupts
 from fragprune_plugins.learning.stage2 import stored_thresholds
-from fragprune_plugins.learning.waiting import between_steps
 
 PLAIN = 0.25
 """gsplat's threshold of plain gradients over that of absolute ones, 0.0002 over 0.0008."""

@@ -47,7 +47,7 @@ class RainDialect(GraphdecoDialect):
     """Vanilla's call of 2023 with a dilation of its own, and depth."""
 
     own_kernels = "compiler"
-    spares = {"wandb": {}}  # imported and never used
+    unneeded = {"wandb": {}}  # imported and never used
     returned = ("image", "radii", "depth")
 
     def unpack(self, call: HostCall) -> RasterInputs:

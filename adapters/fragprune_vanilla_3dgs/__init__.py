@@ -16,15 +16,15 @@ from fragprune_3dgs_fork import ForkAdapter
 from fragprune_3dgs_fork.fork import STATISTICS, read_fork
 from fragprune_graphdeco import GraphdecoAdapter, RasterizerCall, reading
 from fragprune_plugins.adapting import (
-    Door,
     Finding,
     HostInfo,
     HostRepo,
     ModelFileError,
     Role,
+    UntrustedFile,
 )
 
-_EXPOSURES = Door(
+_EXPOSURES = UntrustedFile(
     ModelFileError,
     "not readable as exposures",
     "the exposure.json that the host wrote",

@@ -38,7 +38,7 @@ parser.add_argument("--device", default="cuda", help="cpu, or cuda")
 args = parser.parse_args()
 
 session = fragprune_plugins.activate(host=args.checkout, stage="off")  # above the host's imports
-for name, members in session.dialect.spares.items():
+for name, members in session.dialect.unneeded.items():
     if find_spec(name) is None:
         sys.modules[name] = ModuleType(name)
         vars(sys.modules[name]).update(members)

@@ -26,7 +26,7 @@ from fragprune_plugins.errors import ModelFileError
 from fragprune_plugins.files.columns import change_of, is_plain
 from fragprune_plugins.files.model import REST_COUNTS, Model
 from fragprune_plugins.files.ply_table import HEADER_MAX, Columns, header_lines, read_vertices
-from fragprune_plugins.files.reading import Door, Reading
+from fragprune_plugins.files.reading import Reading, UntrustedFile
 from fragprune_plugins.learning.thresholds import ThresholdStore
 
 THRESHOLD_COLUMN = "trunc_threshold"
@@ -43,7 +43,7 @@ SCALES = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 FILTER = "filter_3D"
 _REMEDY = "Pass the point_cloud.ply that a 3DGS training saved."
-_DOOR = Door(
+_FILE = UntrustedFile(
     ModelFileError,
     "not readable as PLY",
     "a complete trained splat (.ply)",
@@ -84,7 +84,7 @@ def read_ply(path: Path, *, filtered: bool = False) -> Model:
             "Pass its PLY. Fine-tune and draw a host without PLYs (4D models) through its own "
             "script, with fragprune run.",
         )
-    with _DOOR.reading(path) as reading:
+    with _FILE.reading(path) as reading:
         rules = _rules_in(reading)
         try:
             columns = read_vertices(reading)
@@ -210,7 +210,7 @@ def read_thresholds(path: Path) -> ThresholdStore | None:
     column, comment = f" {THRESHOLD_COLUMN}".encode(), f"comment {STOP} ".encode()
     if not any(each.endswith(column) or each.startswith(comment) for each in lines):
         return None
-    with _DOOR.reading(path) as reading:
+    with _FILE.reading(path) as reading:
         rules, columns = _rules_in(reading), read_vertices(reading)
         if (values := columns.get(THRESHOLD_COLUMN)) is None:
             store = ThresholdStore(len(next(iter(columns.values()))))

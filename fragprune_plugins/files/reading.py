@@ -1,7 +1,7 @@
-"""The one door for files that somebody else may have written.
+"""Files that somebody else may have written.
 
-A reader has a ``Door``. It opens regular files only, so it never waits for a pipe or a device, and
-bounds their size. What a parser raises in there becomes the door's one error, with path and place.
+A reader has an ``UntrustedFile``. It opens regular files only, so it never waits for a pipe or a
+device, and bounds their size. What a parser raises becomes its one error, with path and place.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class Door:
+class UntrustedFile:
     """How files of one kind are opened, and what is said where one cannot be read.
 
     Attributes:
@@ -108,7 +108,7 @@ class Door:
         """Open a file for the length of a block, and state whatever the block raises.
 
         Raises:
-            FragpruneError: the door's ``error``, if there is no such file, it is no regular file,
+            FragpruneError: its ``error``, if there is no such file, it is no regular file,
                 it is larger than ``limit``, or the block raised. Errors of fragprune pass, except
                 an InputError: it is about a value that the file holds.
         """
@@ -134,7 +134,7 @@ class Door:
             raise
         except Exception as error:
             at = f" at {reading.place}" if reading.place else ""
-            found = f"{self.broken}{at} ({said(error)})"
+            found = f"{self.broken}{at} ({message_of(error)})"
             raise self.error(str(path), found, self.expected, self.remedy) from error
 
     def _open(self, path: Path) -> BinaryIO:
@@ -194,7 +194,7 @@ def parse_json(text: str) -> Any:
     raise ValueError(f"more than {NESTING} levels")
 
 
-def said(error: BaseException) -> str:
+def message_of(error: BaseException) -> str:
     """What an error says, as one line of bounded length."""
     if isinstance(error, RecursionError):
         return "nested too deeply"

@@ -34,7 +34,7 @@ from fragprune_plugins.files.atomic import (
     replacing,
 )
 from fragprune_plugins.files.ply import read_thresholds
-from fragprune_plugins.files.reading import Door, parse_json
+from fragprune_plugins.files.reading import UntrustedFile, parse_json
 from fragprune_plugins.learning.finite import expect_finite
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import is_rim, is_stop
@@ -231,9 +231,9 @@ def _remedy(model: Path) -> str:
 
 def _read(model: Path, path: Path) -> tuple[dict[str, Any], SidecarInfo]:
     """Read a sidecar's store state and metadata, without a look at the model beside it."""
-    remedy = _remedy(model)
-    door = Door(SidecarError, "unreadable", f"a file of format {FORMAT}", remedy, missing=remedy)
-    with door.reading(path) as reading:
+    expected, remedy = f"a file of format {FORMAT}", _remedy(model)
+    kind = UntrustedFile(SidecarError, "unreadable", expected, remedy, missing=remedy)
+    with kind.reading(path) as reading:
         reading.place = "its header"
         with safe_open(reading.path, framework="pt") as file:
             reading.place = "its metadata"

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from fragprune_plugins.errors import HostNeedsError, ModelFileError, NotComparedError, UsageError
-from fragprune_plugins.files.reading import MEBIBYTE, Door, parse_json
+from fragprune_plugins.files.reading import MEBIBYTE, UntrustedFile, parse_json
 from fragprune_plugins.hosts.dialect import Dialect
 from fragprune_plugins.hosts.findings import Finding, Match
 from fragprune_plugins.hosts.photographs import Photographs
@@ -118,8 +118,8 @@ def read_config(config: ConfigFile, path: Path) -> dict[str, Any]:
         UsageError: the file cannot be read.
     """
     remedy, expected = f"Correct {config.flag} {path}.", "a file the host can read"
-    door = Door(UsageError, "unreadable", expected, remedy, limit=MEBIBYTE, missing=remedy)
-    with door.reading(path):
+    kind = UntrustedFile(UsageError, "unreadable", expected, remedy, limit=MEBIBYTE, missing=remedy)
+    with kind.reading(path):
         try:
             return config.read(path)
         except ImportError as error:

@@ -13,7 +13,7 @@ from fragprune_plugins.hosts.source import HostRepo, imported
 
 
 @dataclass(frozen=True)
-class Tried:
+class Attempt:
     """The result of one adapter on one codebase."""
 
     adapter: HostAdapter
@@ -54,9 +54,9 @@ class Tried:
         return self.verdict() + (f"; {self.errors[0].found}" if self.errors else "")
 
 
-def attempt(repo: HostRepo, adapters: Sequence[HostAdapter]) -> list[Tried]:
+def attempt(repo: HostRepo, adapters: Sequence[HostAdapter]) -> list[Attempt]:
     """Try each adapter on a codebase; returns the results, best fit first."""
-    tried = (Tried(adapter, adapter.match(repo)) for adapter in adapters)
+    tried = (Attempt(adapter, adapter.match(repo)) for adapter in adapters)
     return sorted(tried, key=lambda each: each.order)
 
 
@@ -149,7 +149,7 @@ def choose(
     )
 
 
-def _nearest(tried: Sequence[Tried]) -> str:
+def _nearest(tried: Sequence[Attempt]) -> str:
     """The errors of the adapter that comes nearest, the first."""
     if not tried:
         return "none is installed"
@@ -159,7 +159,7 @@ def _nearest(tried: Sequence[Tried]) -> str:
     return f"the nearest, {best.brief()}" if best.held else "none finds anything of its host"
 
 
-def closest(tried: Sequence[Tried], adapters: Sequence[HostAdapter]) -> list[Tried]:
+def closest(tried: Sequence[Attempt], adapters: Sequence[HostAdapter]) -> list[Attempt]:
     """The adapters that fit, without those that are ancestors of another one."""
     fitting = [each for each in tried if each.match.fits]
     parents = {adapter.name: adapter.descends_from for adapter in adapters}

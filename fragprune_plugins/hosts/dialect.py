@@ -125,7 +125,7 @@ class Dialect(ABC):
     """What compiled modules inside the host's own package need: a "gpu"; or also CUDA's "compiler",
     because they are compiled when they are imported. "" if there are none."""
 
-    spares: ClassVar[Mapping[str, Mapping[str, Any]]] = MappingProxyType({})
+    unneeded: ClassVar[Mapping[str, Mapping[str, Any]]] = MappingProxyType({})
     """Packages that the host can do without on a CPU, by import name: what it needs of each."""
 
     def unproved(self, repo: HostRepo) -> str:

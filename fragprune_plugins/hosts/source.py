@@ -13,13 +13,13 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from fragprune_plugins.errors import UnknownHostError
-from fragprune_plugins.files.reading import MEBIBYTE, Door, lies_in
+from fragprune_plugins.files.reading import MEBIBYTE, UntrustedFile, lies_in
 from fragprune_plugins.hosts.findings import Finding, SeamState
 from fragprune_plugins.hosts.seams import Seam
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
-_DOOR = Door(
+_FILE = UntrustedFile(
     UnknownHostError,
     "no source",
     "a file of a host's source",
@@ -146,7 +146,7 @@ class HostRepo:
         """The text of a file; "" where it is missing, or leads out of the checkout."""
         try:
             if self._inside(path):
-                with _DOOR.reading(path) as reading:
+                with _FILE.reading(path) as reading:
                     return reading.file.read().decode("utf-8", "replace")
         except UnknownHostError:
             pass

@@ -124,7 +124,7 @@ def _expect_trainable(
         adapter.refuse(repo, host.arguments, stage=options.stage, device=device)
         engine_for(options.engine, device)
     dialect = adapter.dialect(repo)
-    answered = {*dialect.names(), *(dialect.spares if device == "cpu" else ())}
+    answered = {*dialect.names(), *(dialect.unneeded if device == "cpu" else ())}
     data = Path(host.flags.source) if trains and host.flags.source else None
     preflight.expect(repo, host.script, answered, data)
     return trains

@@ -19,7 +19,7 @@ from fragprune_plugins.errors import AlignmentError, SessionError, UsageError
 from fragprune_plugins.hosts.dialect import HostCall
 from fragprune_plugins.hosts.seams import SeamCall
 from fragprune_plugins.injection.proofs import proved
-from fragprune_plugins.injection.saving import adopt
+from fragprune_plugins.injection.saving import attach_file
 from fragprune_plugins.injection.state import ModelState, SessionState
 from fragprune_plugins.injection.stepping import (
     asking_for_no_gradient,
@@ -53,7 +53,7 @@ def on_view(session: SessionState, call: SeamCall) -> Any:
     own = len(call.seam.needs) > 1  # a function takes the model; a method belongs to it
     model = call.arguments[call.seam.needs[1]] if own else session.model_of(call)
     if model is None:
-        expect_adopted(session, call)
+        expect_unpacked_attached(session, call)
         if session.learn and torch.is_grad_enabled() and not session.warned:
             session.warned = True
             log.warning(
@@ -61,7 +61,7 @@ def on_view(session: SessionState, call: SeamCall) -> Any:
             )
         return call.run()
     if session.unpacked is not None:
-        adopt(session, model, *session.unpacked)
+        attach_file(session, model, *session.unpacked)
     state, view = session.models.get(model), session.adapter.view(call.first)
     begins = session.adapter.steps_by_rendering and session.learn and torch.is_grad_enabled()
     if begins and state is not None and not state.begun:
@@ -96,7 +96,7 @@ def expect_to_train(session: SessionState, call: SeamCall, model: Any) -> None:
         )
 
 
-def expect_adopted(session: SessionState, call: SeamCall) -> None:
+def expect_unpacked_attached(session: SessionState, call: SeamCall) -> None:
     """Refuse to draw an unpacked file's Gaussians without its thresholds.
 
     Raises:
@@ -266,7 +266,7 @@ def rasterize(
         return engine.rasterize(replace(inputs, stop=None), None)
 
     area = area_per_pixel(inputs) if state.stage.settings.goal.on_area else None
-    pressure = state.stage.drew(view, outputs, untruncated, part, area)
+    pressure = state.stage.on_drawn(view, outputs, untruncated, part, area)
     if pressure is None or not outputs.image.requires_grad:
         return outputs
     return replace(outputs, image=_AddToLoss.apply(outputs.image, pressure))  # type: ignore[no-untyped-call]
@@ -277,7 +277,7 @@ def on_loss(session: SessionState, call: SeamCall) -> Any:
     state = session.last_state
     if state is not None and call.instance.numel() == 1:
         if state.stage is not None and (state.begun or len(session.models) == 1):
-            state.stage.lost(call.instance)
+            state.stage.on_loss(call.instance)
         for each in session.models.values():
             each.begun = False
     return call.run()

@@ -85,8 +85,8 @@ def on_unpack(session: SessionState, call: SeamCall) -> Any:
     return result
 
 
-def adopt(session: SessionState, model: Any, expected: Tensor, store: ThresholdStore) -> None:
-    """Give thresholds of an unpacked file to the model that the host draws next.
+def attach_file(session: SessionState, model: Any, expected: Tensor, store: ThresholdStore) -> None:
+    """Attach the thresholds of an unpacked file to the model that the host draws next.
 
     A model that has thresholds already takes these if it has the file's Gaussians: the host
     resumes it. If not, they wait for another model.

@@ -71,7 +71,7 @@ class StandIns:
                     "Start the host with fragprune run, or call activate() above those imports.",
                 )
             sys.modules[name] = self._placed[name] = module
-        for name, members in self._dialect.spares.items() if self._drop_in else ():
+        for name, members in self._dialect.unneeded.items() if self._drop_in else ():
             if name not in sys.modules and find_spec(name) is None:
                 log.warning("%s is not installed: the host imports an empty stand-in", name)
                 module = ModuleType(name, "Stand-in of fragprune: empty.")

@@ -17,7 +17,7 @@ from fragprune_plugins.errors import ModelFileError, UsageError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.ply import read_thresholds
-from fragprune_plugins.files.reading import Door
+from fragprune_plugins.files.reading import UntrustedFile
 from fragprune_plugins.hosts.adapter import (
     CHECKPOINT_KEY,
     CommandLine,
@@ -29,7 +29,7 @@ from fragprune_plugins.injection.process import knowing_numpy
 
 log = logging.getLogger("fragprune")
 
-_DOOR = Door(
+_FILE = UntrustedFile(
     ModelFileError,
     "not readable as a checkpoint",
     "(capture, iteration), as hosts save it",
@@ -239,7 +239,7 @@ def _read_checkpoint(path: Path) -> tuple[Any, int]:
     """Read (capture, iteration) of a checkpoint; tensors are mapped from the file."""
     if not path.exists():
         raise UsageError(str(path), "no such file", "a checkpoint", "Check the path.")
-    with _DOOR.reading(path), knowing_numpy():
+    with _FILE.reading(path), knowing_numpy():
         # Safely, nothing in it is run; an old torch loads it as the hosts do.
         capture, iteration = torch.load(path, "cpu", **_SAFELY)
         return capture, int(iteration)

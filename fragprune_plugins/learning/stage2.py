@@ -77,7 +77,7 @@ def learned_thresholds(inputs: RasterInputs, store: ThresholdStore) -> Tensor | 
     return None if store.neutral else store.values
 
 
-def evenly(views: Sequence[View], most: int) -> Sequence[View]:
+def evenly_spaced(views: Sequence[View], most: int) -> Sequence[View]:
     """Views at even distances, so many at most, from the first on."""
     return views[:: max(1, -(-len(views) // most))]
 
@@ -229,7 +229,7 @@ class Stage2:
         splats = replace(inputs.splats, opacities=torch.where(kept, more, 0.0))
         return replace(inputs, splats=splats)
 
-    def drew(
+    def on_drawn(
         self,
         view: Hashable,
         outputs: RasterOutputs,
@@ -265,7 +265,7 @@ class Stage2:
             return None
         return pressed * (self.pressure.value / self._views.expected)
 
-    def lost(self, loss: Tensor) -> None:
+    def on_loss(self, loss: Tensor) -> None:
         """The loss of the view drawn last, without the pressure, went backward."""
         self._views.lose(loss.detach())
 
@@ -423,7 +423,7 @@ class Stage2:
     def _meet_target(self, target: Target, progress: float) -> None:
         """Late in the run, and again before its last step, shift all thresholds onto the target."""
         known = dict.fromkeys(view for view, _ in self._before)
-        views = evenly([view for view in known if view in self._again], CALIBRATION_VIEWS)
+        views = evenly_spaced([view for view in known if view in self._again], CALIBRATION_VIEWS)
         due = progress >= 1.0 or (progress >= CALIBRATE_AT and not self._held)
         if not views or (self._held and not due):
             return

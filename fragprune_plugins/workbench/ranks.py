@@ -182,13 +182,13 @@ def joined(device: torch.device) -> Iterator[Ranks]:
     try:
         yield ranks
     except BaseException:
-        speaks()  # before the others notice that this process is gone
+        should_print()  # before the others notice that this process is gone
         raise
     finally:
         dist.destroy_process_group()
 
 
-def speaks() -> bool:
+def should_print() -> bool:
     """Whether this process is the first of all that asks: it says why they end, and others do not.
 
     Without a launcher whose store outlives its processes everyone speaks.

@@ -7,8 +7,8 @@ import time
 
 import pytest
 
+from fragprune_plugins.learning.deferred import between_steps
 from fragprune_plugins.learning.interruption import Terminate, sigterm_interrupts
-from fragprune_plugins.learning.waiting import between_steps
 
 
 @pytest.fixture(autouse=True)

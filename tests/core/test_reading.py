@@ -1,4 +1,4 @@
-"""The one door for files: what it opens, what it says, and every reader behind it."""
+"""Untrusted files: what is opened, what it says, and every reader behind it."""
 
 import ast
 import errno
@@ -30,7 +30,7 @@ from fragprune_plugins.errors import (
 )
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply, read_thresholds
-from fragprune_plugins.files.reading import NESTING, Door, lies_in
+from fragprune_plugins.files.reading import NESTING, UntrustedFile, lies_in
 from fragprune_plugins.hosts.adapter import ConfigFile, read_config
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.starting import _SAFELY, _read_checkpoint
@@ -96,7 +96,7 @@ SPECIAL = {
 }
 """What is no regular file."""
 
-DOOR = Door(RecordError, "broken", "a file", "Write it again.", limit=100)
+SMALL = UntrustedFile(RecordError, "broken", "a file", "Write it again.", limit=100)
 
 
 @pytest.fixture(autouse=True)
@@ -128,8 +128,8 @@ def read_sidecar(path):
     sidecar.load(model)
 
 
-def use(path, act, door=None):
-    with (door or DOOR).reading(path) as reading:
+def use(path, act, kind=None):
+    with (kind or SMALL).reading(path) as reading:
         reading.place = "line 3"
         return act(reading)
 
@@ -215,7 +215,7 @@ def test_a_file_is_bounded_and_so_is_what_it_announces(tmp_path):
     with pytest.raises(RecordError, match=r"101 bytes.*at most 100"):
         use(path, lambda reading: None)
     path.write_bytes(bytes(100))
-    with DOOR.reading(path) as reading:
+    with SMALL.reading(path) as reading:
         assert reading.take(60) == bytes(60)
         reading.skip(30)
         assert reading.left == 10
@@ -227,14 +227,14 @@ def test_a_file_is_bounded_and_so_is_what_it_announces(tmp_path):
 @pytest.mark.parametrize("ends", [('{"a":', "}"), ("[", "]")])
 @pytest.mark.parametrize("depth", [NESTING - 1, NESTING, 100_000])
 def test_json_is_bounded_in_depth(tmp_path, depth, ends):
-    door = Door(RecordError, "broken", "a file", "Write it again.")
+    kind = UntrustedFile(RecordError, "broken", "a file", "Write it again.")
     path = tmp_path / "a.json"
     path.write_text(ends[0] * depth + "1" + ends[1] * depth)
     if depth < NESTING:
-        assert use(path, lambda reading: reading.json(), door)
+        assert use(path, lambda reading: reading.json(), kind)
     else:
         with pytest.raises(RecordError, match=rf"more than {NESTING} levels|deeply"):
-            use(path, lambda reading: reading.json(), door)
+            use(path, lambda reading: reading.json(), kind)
 
 
 # -- PLY -----------------------------------------------------------------------------------------
@@ -425,7 +425,7 @@ def test_checkpoints_are_loaded_by_the_safe_loader_alone():
 @pytest.mark.parametrize(("asked", "given"), [(1 << 62, 3), (2 << 20, 2), (-1, 3), (None, 3)])
 def test_a_read_takes_no_more_memory_than_the_file_has_bytes_left(tmp_path, asked, given):
     (tmp_path / "a").write_bytes(bytes(4 << 20))
-    with Door(RecordError, "broken", "a file", "Write it again.").reading(
+    with UntrustedFile(RecordError, "broken", "a file", "Write it again.").reading(
         tmp_path / "a"
     ) as reading:
         reading.skip(1 << 20)
@@ -442,7 +442,7 @@ def test_a_pipe_that_takes_a_files_place_meanwhile_is_not_waited_for(tmp_path, m
     os.mkfifo(pipe)
     before = Path(__file__).stat()
     monkeypatch.setattr(Path, "stat", lambda path, **_: before)  # as it was when it was looked at
-    with pytest.raises(RecordError, match="no regular file") as caught, DOOR.reading(pipe):
+    with pytest.raises(RecordError, match="no regular file") as caught, SMALL.reading(pipe):
         pass
     assert caught.value.where == str(pipe)
 
@@ -462,7 +462,7 @@ def test_a_file_that_the_system_does_not_open_is_named_with_the_reason(
 
     (tmp_path / "a").touch()
     monkeypatch.setattr(os, "open", refused)
-    with pytest.raises(RecordError) as caught, DOOR.reading(tmp_path / "a"):
+    with pytest.raises(RecordError) as caught, SMALL.reading(tmp_path / "a"):
         pass
     assert caught.value.where == str(tmp_path / "a")
     assert caught.value.found == f"cannot be opened ({why})"

@@ -12,7 +12,7 @@ import torch
 from fragprune_plugins import Control, Fewer, Pressure, ThresholdStore
 from fragprune_plugins.errors import ResetError, UsageError
 from fragprune_plugins.learning.schedule import JointSchedule, Schedule, Settings, StepPlan
-from fragprune_plugins.learning.stage2 import Stage2, evenly, stored_thresholds
+from fragprune_plugins.learning.stage2 import Stage2, evenly_spaced, stored_thresholds
 from fragprune_plugins.workbench.finetune.faster import FrameTarget
 from fragprune_plugins.workbench.finetune.processes import SharedStage
 from fragprune_plugins.workbench.goals import TIME_FOLLOWS, Faster
@@ -43,8 +43,8 @@ def step(it: Stage2, *views: str, loss: float = 0.5):
     terms = []
     for view in views:
         it.thresholds(None)
-        term = it.drew(view, drawing(it.store, 10.0), lambda: drawing(None, 20.0))
-        it.lost(torch.tensor(loss))
+        term = it.on_drawn(view, drawing(it.store, 10.0), lambda: drawing(None, 20.0))
+        it.on_loss(torch.tensor(loss))
         terms.append(term)
     pressure = [term for term in terms if term is not None]
     if pressure:
@@ -93,7 +93,7 @@ def test_a_view_drawn_without_gradients_feels_no_pressure_and_is_no_first_visit(
     it = stage()
     it.begin(lambda: OPACITIES)
     with torch.no_grad():
-        assert it.drew("a", drawing(it.store, 10.0), lambda: drawing(None, 20.0)) is None
+        assert it.on_drawn("a", drawing(it.store, 10.0), lambda: drawing(None, 20.0)) is None
     assert not it.viewed
     assert it.progress().fragments_before is None
 
@@ -119,7 +119,7 @@ def test_a_warm_up_draws_without_thresholds_and_counts_what_came_in():
     )
     it.begin(lambda: OPACITIES)
     assert it.thresholds(None) is None
-    assert it.drew("a", drawing(None, 20.0), lambda: drawing(None, 20.0)) is None  # no pressure
+    assert it.on_drawn("a", drawing(None, 20.0), lambda: drawing(None, 20.0)) is None  # no pressure
     it.end()
     assert it.store.neutral
     assert not it.viewed
@@ -143,7 +143,7 @@ def test_a_control_draws_without_thresholds_and_still_counts():
     it = stage(settings=Settings(iterations=10, goal=Control()), watch=told.append)
     it.begin(lambda: OPACITIES)
     assert it.thresholds(None) is None
-    assert it.drew("a", drawing(None, 20.0), lambda: drawing(None, 20.0)) is None
+    assert it.on_drawn("a", drawing(None, 20.0), lambda: drawing(None, 20.0)) is None
     it.end()
     it.close()
     assert it.store.neutral
@@ -154,7 +154,7 @@ def test_a_control_draws_without_thresholds_and_still_counts():
 def test_a_loss_without_a_view_is_nobodys():
     it = stage()
     it.begin(lambda: OPACITIES)
-    it.lost(torch.tensor(3.0))
+    it.on_loss(torch.tensor(3.0))
     it.close()
     assert it.progress().fragments_before is None
 
@@ -166,7 +166,7 @@ def falling(goal, iterations, names="abc", **options) -> tuple[Stage2, dict[str,
 
     def draw(view):
         outputs = SimpleNamespace(fragments_per_pixel=20 * (1 - it.store.values.mean()))
-        return it.drew(view, outputs, lambda: drawing(None, 20.0))
+        return it.on_drawn(view, outputs, lambda: drawing(None, 20.0))
 
     views |= {view: lambda view=view: draw(view) for view in names}
     return it, views
@@ -280,7 +280,7 @@ def test_opacities_are_worked_out_only_while_there_are_rows_to_open():
 
 @pytest.mark.parametrize("count", [0, 1, 3, 4, 5, 11, 100])
 def test_chosen_views_are_spread_over_all_of_them(count):
-    chosen = evenly(range(count), 3)
+    chosen = evenly_spaced(range(count), 3)
     assert len(chosen) <= 3
     assert count == 0 or chosen[0] == 0
     gaps = [b - a for a, b in pairwise([*chosen, count])]
@@ -318,8 +318,8 @@ def drawn_by_one(it: SharedStage, names: str) -> list[list[float]]:
     it.begin(lambda: OPACITIES)
     for name in names:
         size = 1.0 + "ab".index(name)
-        it.drew(name, drawing(None, 8 * size), lambda size=size: drawing(None, 20 * size))
-        it.lost(torch.tensor(size / 8))
+        it.on_drawn(name, drawing(None, 8 * size), lambda size=size: drawing(None, 20 * size))
+        it.on_loss(torch.tensor(size / 8))
     return it.figures()
 
 

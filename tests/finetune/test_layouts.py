@@ -15,7 +15,7 @@ from PIL import Image
 from fragprune_plugins import load_cameras, measure
 from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.workbench.finetune.loop import photometric_loss
-from fragprune_plugins.workbench.scenes.dataset import Pictures, Slot, load_dataset
+from fragprune_plugins.workbench.scenes.dataset import Pictures, PixelSlot, load_dataset
 from fragprune_plugins.workbench.scenes.posed import Posed, split
 
 
@@ -184,7 +184,7 @@ def test_pictures_are_kept_only_while_there_is_room():
 
         return load
 
-    kept, slots = Pictures(room=250), [Slot() for _ in range(5)]
+    kept, slots = Pictures(room=250), [PixelSlot() for _ in range(5)]
     for number in (0, 1, 0, 2, 0, 1):  # 1 was not used for longest when 2 came
         assert int(kept.get(slots[number], loader(number))[0]) == number
         assert kept.size <= 250
@@ -193,7 +193,7 @@ def test_pictures_are_kept_only_while_there_is_room():
 
 def test_pictures_larger_than_the_room_are_kept_one_at_a_time():
     kept = Pictures(room=10)
-    slots = [Slot() for _ in range(3)]
+    slots = [PixelSlot() for _ in range(3)]
     for slot in slots:
         kept.get(slot, lambda: torch.zeros(100, dtype=torch.uint8))
         assert kept.size == 100
@@ -202,7 +202,7 @@ def test_pictures_larger_than_the_room_are_kept_one_at_a_time():
 def test_a_forgotten_photograph_takes_its_pixels_along():
     kept = Pictures(room=1000)
     for _ in range(50):
-        kept.get(Slot(), lambda: torch.zeros(100, dtype=torch.uint8))
+        kept.get(PixelSlot(), lambda: torch.zeros(100, dtype=torch.uint8))
     assert kept.size == 0
 
 

@@ -19,7 +19,7 @@ from fragprune_plugins.errors import RanksError, UsageError
 from fragprune_plugins.workbench import ranks as module
 from fragprune_plugins.workbench.finetune import loop, processes
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
-from fragprune_plugins.workbench.ranks import Ranks, fingerprint, joined, launched, speaks
+from fragprune_plugins.workbench.ranks import Ranks, fingerprint, joined, launched, should_print
 
 ALL = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
 
@@ -259,5 +259,5 @@ def test_no_thread_of_the_group_outlives_it(tmp_path):
 
 
 def test_one_of_all_processes_speaks_whoever_asks_first():
-    assert sorted(each.left for each in launch(3, lambda _: speaks())) == [False, False, True]
-    assert speaks()
+    assert sorted(each.left for each in launch(3, lambda _: should_print())) == [False, False, True]
+    assert should_print()

@@ -19,14 +19,14 @@ from typing import Any
 from fragprune_plugins.constants import VERSION
 from fragprune_plugins.errors import RecordError
 from fragprune_plugins.files.atomic import replacing
-from fragprune_plugins.files.reading import MEBIBYTE, Door
+from fragprune_plugins.files.reading import MEBIBYTE, UntrustedFile
 from fragprune_plugins.workbench.figures.records import strict
 from fragprune_plugins.workbench.models.model import writable_folder
 
 RESULTS = (".md", ".csv", ".png")
 """Endings of the files that results are written to, after the experiment's name."""
 
-_DOOR = Door(
+_FILE = UntrustedFile(
     RecordError,
     "unreadable",
     "a file that an experiment wrote",
@@ -198,7 +198,7 @@ def _csv(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def _load(path: Path) -> dict[str, Any]:
-    with _DOOR.reading(path) as reading:
+    with _FILE.reading(path) as reading:
         content = reading.json()
         if not isinstance(content, dict):
             raise ValueError("not an object")

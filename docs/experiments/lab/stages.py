@@ -14,7 +14,7 @@ import torch
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.hosts.photographs import Photographs
-from fragprune_plugins.learning.stage2 import evenly
+from fragprune_plugins.learning.stage2 import evenly_spaced
 from fragprune_plugins.types import View
 from fragprune_plugins.workbench.figures.clock import timed
 from fragprune_plugins.workbench.figures.evaluate import Candidate
@@ -69,7 +69,7 @@ def run(
     sizes = SIZES if sizes is None else sizes
     columns, said = load_columns(paths, device)
     dataset = load_photographs(photographs).to(device)
-    views = [shot.view for shot in evenly(dataset.test, _VIEWS)]
+    views = [shot.view for shot in evenly_spaced(dataset.test, _VIEWS)]
     asked = {
         "asks": QUESTIONS[NAME],
         "models": said,

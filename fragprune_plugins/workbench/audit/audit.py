@@ -212,7 +212,7 @@ def audit(
         Figures as plain values, and the views that pictures show.
     """
     survey = _Survey(model, engine)
-    chosen = _amid(len(views))
+    chosen = _middles(len(views))
     each = max(1, tiles // len(views))
     steps = each + 1  # of a view: the pictures, then the tiles, of which small ones have fewer
     with tqdm(total=steps * len(views), desc="audit", unit="tile", disable=not progress) as bar:
@@ -309,7 +309,7 @@ def _sizes(timed: Sequence[Shown]) -> str:
     return " to ".join(ends)
 
 
-def _amid(count: int) -> list[int]:
+def _middles(count: int) -> list[int]:
     """Some evenly spread numbers, the middle ones of as many parts: an orbit begins at a pole."""
     parts = min(SHOWN, count)
     return [(2 * part + 1) * count // (2 * parts) for part in range(parts)]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from fragprune_plugins.files.atomic import replacing
-from fragprune_plugins.learning.stage2 import evenly
+from fragprune_plugins.learning.stage2 import evenly_spaced
 from fragprune_plugins.workbench.audit import page
 from fragprune_plugins.workbench.audit.audit import audit as measured
 from fragprune_plugins.workbench.audit.placing import Placed, Side, place
@@ -93,7 +93,7 @@ def _given(
         train, test = load_scene_cameras(data, white_background=white_background)
         named = sorted([*train, *test], key=lambda each: each[0])
     every = len(named)
-    chosen = list(evenly(named, count))
+    chosen = list(evenly_spaced(named, count))
     longest = max(max(view.width, view.height) for _, view in chosen)
     chosen = divided(chosen, divide or -(-longest // LARGEST))
     why = f"{len(chosen)} of the {every} cameras of {cameras or data}, evenly spread."

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from fragprune_plugins.errors import UnknownHostError
 from fragprune_plugins.hosts.adapter import HostAdapter, ScriptAdapter
-from fragprune_plugins.hosts.choosing import Tried, attempt, closest, locate, usage
+from fragprune_plugins.hosts.choosing import Attempt, attempt, closest, locate, usage
 from fragprune_plugins.hosts.dialect import Dialect, Proof
 from fragprune_plugins.hosts.findings import Finding, Plain
 from fragprune_plugins.hosts.preflight import Missing, install, missing_imports
@@ -117,7 +117,7 @@ _NEAREST = 3
 _KINDS = ("fits", "several", "inside", "finetune", "never")
 
 
-def _in_short(tried: list[Tried], fitting: list[Tried], differs: Sequence[str]) -> list[str]:
+def _in_short(tried: list[Attempt], fitting: list[Attempt], differs: Sequence[str]) -> list[str]:
     """A line for each adapter that fits; else how the nearest differs, and the next reasons."""
     shown = fitting or _nearest(tried)
     if not shown:
@@ -133,16 +133,16 @@ def _in_short(tried: list[Tried], fitting: list[Tried], differs: Sequence[str]) 
     ]
 
 
-def _nearest(tried: list[Tried]) -> list[Tried]:
+def _nearest(tried: list[Attempt]) -> list[Attempt]:
     """The adapters that come nearest, of several with the same reason the first."""
-    reasons: dict[str, Tried] = {}
+    reasons: dict[str, Attempt] = {}
     for each in tried:
         if each.held and each.errors:
             reasons.setdefault(each.errors[0].found, each)
     return list(reasons.values())[:_NEAREST]
 
 
-def _aside(tried: Tried, fitting: list[Tried]) -> str:
+def _aside(tried: Attempt, fitting: list[Attempt]) -> str:
     """The reason why an adapter is not among the best fits."""
     nearer = ", ".join(each.adapter.name for each in fitting)
     return str(tried.errors[0]) if tried.errors else f"{nearer} descends from it"
@@ -151,7 +151,7 @@ def _aside(tried: Tried, fitting: list[Tried]) -> str:
 _SIGNS = {"missing": "MISSING in", "changed": "CHANGED at", "at import": "(checked at import)"}
 
 
-def _in_full(tried: list[Tried], fitting: list[Tried]) -> list[str]:
+def _in_full(tried: list[Attempt], fitting: list[Attempt]) -> list[str]:
     """All seams of the adapters that fit, or of the nearest; the first error of each other one."""
     shown = fitting or tried[:1]
     lines = []
@@ -171,7 +171,7 @@ def _in_full(tried: list[Tried], fitting: list[Tried]) -> list[str]:
     return [*lines, *(f"  {each.verdict()}; {_aside(each, fitting)}" for each in others)]
 
 
-def _as_dict(tried: Tried) -> dict[str, Any]:
+def _as_dict(tried: Attempt) -> dict[str, Any]:
     """All findings and seams of one adapter, for --json."""
     return {
         "adapter": tried.adapter.name,
@@ -198,7 +198,7 @@ def _missing(repo: HostRepo, adapter: HostAdapter) -> list[Missing]:
     if not isinstance(adapter, ScriptAdapter):
         return []
     scripts, dialect = adapter.command_line(repo).scripts, adapter.dialect(repo)
-    answered = {*dialect.names(), *dialect.spares}
+    answered = {*dialect.names(), *dialect.unneeded}
     return missing_imports(repo, [repo.root / name for name in scripts], answered)
 
 
@@ -235,7 +235,7 @@ def _repository(host: Path, adapters: list[HostAdapter], name: str | None) -> Ho
         return repo
 
 
-def _conclusion(repo: HostRepo, fitting: list[Tried]) -> str:
+def _conclusion(repo: HostRepo, fitting: list[Attempt]) -> str:
 
     if len(fitting) == 1:
         return f"Use: {usage(fitting[0].adapter, repo)}"
@@ -286,7 +286,7 @@ class Verdict:
 
 def judge(
     repo: HostRepo,
-    tried: Sequence[Tried],
+    tried: Sequence[Attempt],
     adapters: Sequence[HostAdapter],
     plugins: Plugins,
 ) -> Verdict:
@@ -344,14 +344,14 @@ def models_of(repo: HostRepo, plugins: Plugins) -> Sequence[Plain]:
     return found or [Plain(("no plugin reads what it saves",))]
 
 
-def _unproved(repo: HostRepo, fitting: Tried) -> str:
+def _unproved(repo: HostRepo, fitting: Attempt) -> str:
     """What reading cannot show about a host that fits."""
     warned = [each.found for each in fitting.match.findings if each.level == "warning"]
     told = "; ".join(filter(None, [*warned, fitting.adapter.dialect(repo).unproved(repo)]))
     return told or "its picture; the rule in its vendored rasterizer is the known one"
 
 
-def differences(repo: HostRepo, tried: Tried, elsewhere: str) -> tuple[str, ...]:
+def differences(repo: HostRepo, tried: Attempt, elsewhere: str) -> tuple[str, ...]:
     """How a checkout differs from an adapter's host, in short lines.
 
     Args:

@@ -27,7 +27,7 @@ from fragprune_plugins.errors import (
 from fragprune_plugins.learning.interruption import EXIT_CODE, Terminate
 from fragprune_plugins.workbench.commands.rules import Rules
 from fragprune_plugins.workbench.figures.records import strict
-from fragprune_plugins.workbench.ranks import launched, speaks
+from fragprune_plugins.workbench.ranks import launched, should_print
 
 JSON = "fragprune.json"
 """Key of a bool in the context's ``meta``: stdout gets only one JSON object."""
@@ -102,7 +102,7 @@ class Command(click.Command):
         except FragpruneError as error:
             raise _stated(error, as_json=as_json) from error
         except KeyboardInterrupt as error:
-            if speaks():
+            if should_print():
                 click.echo("Interrupted.", err=True)
             ctx.exit(EXIT_CODE if isinstance(error, Terminate) else 130)
         if report is None:
@@ -159,7 +159,7 @@ class Group(click.Group):
 
 def _stated(error: FragpruneError, *, as_json: bool) -> click.exceptions.Exit:
     """Print an error, as JSON on stdout if asked for; returns the exit with its code."""
-    if speaks():
+    if should_print():
         text = json.dumps({"error": error.as_dict()}) if as_json else str(error)
         click.echo(text, err=not as_json)
     codes = {UsageError: 2, Interrupted: 130, Terminated: EXIT_CODE}
@@ -206,7 +206,7 @@ def usage_error(error: click.UsageError, words: list[str]) -> Exception:
         error: click's error.
         words: words of the command line. Words after ``--`` belong to the host's command.
     """
-    if not speaks():
+    if not should_print():
         return click.exceptions.Exit(2)
     if "--json" not in _ours(words):
         return error

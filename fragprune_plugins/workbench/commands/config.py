@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from fragprune_plugins.errors import UsageError
-from fragprune_plugins.files.reading import MEBIBYTE, Door
+from fragprune_plugins.files.reading import MEBIBYTE, UntrustedFile
 from fragprune_plugins.workbench.commands.options import FILE
 
 if sys.version_info >= (3, 11):
@@ -23,9 +23,9 @@ def _read_config(ctx: click.Context, param: click.Parameter, value: Path | None)
     if value is None:
         return None
     remedy = "Write one option a line, such as target-speedup = 2."
-    door = Door(UsageError, "not readable as TOML", "a TOML file", remedy, limit=MEBIBYTE)
+    kind = UntrustedFile(UsageError, "not readable as TOML", "a TOML file", remedy, limit=MEBIBYTE)
     try:
-        with door.reading(value) as reading:
+        with kind.reading(value) as reading:
             values = tomllib.loads(reading.text())
     except UsageError as error:
         raise click.BadParameter(str(error), ctx, param) from error

@@ -152,7 +152,7 @@ def own_cameras(record: records.Record, scene: SceneOptions | None = None) -> Ow
     if record.data.get("target") != ITSELF:
         return None
     scene = scene or SceneOptions()
-    with records.DOOR.stated(record.path) as reading:
+    with records.RECORD_FILE.stated(record.path) as reading:
         reading.place = "data.cameras"
         values = record.data.get("cameras") or {}
         folder = record.path.parent

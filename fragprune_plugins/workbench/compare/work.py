@@ -87,7 +87,7 @@ def _figures(
         "device": before["device"],
         "enlarge": enlarge,
         "scene": plain(photographs) if photographs else None,
-        "warnings": wording.nothing_drawn(drawn) + wording.strangers(before, after),
+        "warnings": wording.nothing_drawn(drawn) + wording.unrelated(before, after),
     }
 
 

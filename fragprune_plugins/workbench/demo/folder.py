@@ -9,13 +9,13 @@ from pathlib import Path
 
 from fragprune_plugins.errors import OutputError
 from fragprune_plugins.files.atomic import digest, replacing
-from fragprune_plugins.files.reading import MEBIBYTE, Door
+from fragprune_plugins.files.reading import MEBIBYTE, UntrustedFile
 from fragprune_plugins.workbench.models.model import writable_folder
 
 MARKER = ".fragprune-demo"
 """JSON with "files": SHA-256 of each file that the demo wrote, by path in the folder."""
 
-_DOOR = Door(OutputError, "no list", "a list of files", "Remove it.", limit=MEBIBYTE)
+_FILE = UntrustedFile(OutputError, "no list", "a list of files", "Remove it.", limit=MEBIBYTE)
 
 _REMEDY = "Choose another --out, or move your files away and delete the others yourself."
 
@@ -74,7 +74,7 @@ def _files(out: Path) -> dict[str, Path]:
 def _listed(out: Path) -> dict[str, str]:
     """SHA-256 by path, as the marker lists them; {} if the marker is missing or broken."""
     try:
-        with _DOOR.reading(out / MARKER) as reading:
+        with _FILE.reading(out / MARKER) as reading:
             return {str(name): str(sha) for name, sha in reading.json()["files"].items()}
     except OutputError:
         return {}

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.files.atomic import replacing
-from fragprune_plugins.learning.stage2 import evenly
+from fragprune_plugins.learning.stage2 import evenly_spaced
 from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.scenes.dataset import Shot
@@ -150,7 +150,7 @@ def draw_panels(
 ) -> list[Path]:
     """Draw ``PANELS`` evenly spread views at most: photograph, renders, fragments on one scale."""
     files = []
-    chosen = evenly(shots, PANELS)
+    chosen = evenly_spaced(shots, PANELS)
     for stem, shot in zip(stems([shot.name for shot in chosen]), chosen, strict=True):
         shown, heat = [(shot.target, shot.image)], []
         for name, candidate in columns.items():

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
-from fragprune_plugins.workbench.figures.records import DOOR, Record, located
+from fragprune_plugins.workbench.figures.records import RECORD_FILE, Record, located
 
 _NUMBERS = {"scale_modifier", "dilation", "near", "alpha_max"}
 """Fields of ``RasterInputs`` that a record may set to a number."""
@@ -49,7 +49,7 @@ def recorded(record: Record) -> Recorded | None:
     Raises:
         RecordError: they are of other types.
     """
-    with DOOR.stated(record.path) as reading:
+    with RECORD_FILE.stated(record.path) as reading:
         values = record.data.get("photographs")
         if values is None:
             return None

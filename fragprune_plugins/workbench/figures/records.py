@@ -13,14 +13,14 @@ from typing import Any
 
 from fragprune_plugins.errors import RecordError
 from fragprune_plugins.files.atomic import replacing
-from fragprune_plugins.files.reading import MEBIBYTE, Door, lies_in
+from fragprune_plugins.files.reading import MEBIBYTE, UntrustedFile, lies_in
 
 SUFFIX = ".fragprune.json"
 FORMAT = "fragprune-record-1"
-DOOR = Door(
+RECORD_FILE = UntrustedFile(
     RecordError, "unreadable", f"a file of format {FORMAT}", "Remove it.", limit=64 * MEBIBYTE
 )
-"""``DOOR.stated(record.path)`` is around whatever takes values out of a record."""
+"""``RECORD_FILE.stated(record.path)`` is around whatever takes values out of a record."""
 
 CONTROL = "control"
 """The goal of a control, as settings in records have it."""
@@ -151,7 +151,7 @@ def control_of(data: dict[str, Any], among: Sequence[Path]) -> dict[str, Any] | 
         among: the files to search; the last match counts.
     """
     for path in reversed(among):
-        with contextlib.suppress(RecordError), DOOR.stated(path):
+        with contextlib.suppress(RecordError), RECORD_FILE.stated(path):
             other = _read(path).data
             if _is_control(other, data):
                 after: dict[str, Any] = other["after"]
@@ -178,7 +178,7 @@ def _is_control(other: dict[str, Any], data: dict[str, Any]) -> bool:
 
 
 def _read(path: Path) -> Record:
-    with DOOR.reading(path) as reading:
+    with RECORD_FILE.reading(path) as reading:
         content = reading.json()
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             raise ValueError("another format")

@@ -279,7 +279,7 @@ def _fell(before: dict[str, Any], after: dict[str, Any], control: dict[str, Any]
     return f" Warning: PSNR fell by {loss:.2f} dB against {against}."
 
 
-def strangers(a: dict[str, Any], b: dict[str, Any]) -> list[str]:
+def unrelated(a: dict[str, Any], b: dict[str, Any]) -> list[str]:
     """A warning where one of two models A and B hardly shows the photographs that the other shows.
 
     A fine-tuning loses a few dB at most. Models of other scenes, or in another world frame, lose

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from fragprune_plugins.errors import CheckpointError, SidecarError
 from fragprune_plugins.files.atomic import replacing
-from fragprune_plugins.files.reading import Door, parse_json
+from fragprune_plugins.files.reading import UntrustedFile, parse_json
 from fragprune_plugins.learning.finite import expect_finite
 
 FORMAT = "fragprune-checkpoint-1"
@@ -24,7 +24,7 @@ UNFIT = (
 """What is raised where the parts of a checkpoint do not fit what they are loaded into."""
 
 _REMEDY = "Remove it, or begin anew with --again."
-_DOOR = Door(CheckpointError, "unreadable", f"a file of format {FORMAT}", _REMEDY)
+_FILE = UntrustedFile(CheckpointError, "unreadable", f"a file of format {FORMAT}", _REMEDY)
 
 
 def save(path: Path, tensors: dict[str, Tensor], values: dict[str, Any]) -> None:
@@ -54,7 +54,7 @@ def load(
     Raises:
         CheckpointError: it cannot be read, or holds NaN or infinity.
     """
-    with _DOOR.reading(path) as reading, safe_open(reading.path, framework="pt") as file:
+    with _FILE.reading(path) as reading, safe_open(reading.path, framework="pt") as file:
         metadata = file.metadata()
         if metadata["format"] != FORMAT:
             raise ValueError(f"format {metadata['format'][:80]!r}")

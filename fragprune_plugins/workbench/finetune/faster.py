@@ -14,7 +14,7 @@ from torch import Tensor
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.learning.stage2 import evenly
+from fragprune_plugins.learning.stage2 import evenly_spaced
 from fragprune_plugins.learning.targets import FEWEST, Target, calibrate
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.workbench.figures.evaluate import Candidate, rounds
@@ -150,7 +150,7 @@ def require_reach(target: float, model: Model, shots: Sequence[Shot], engine: En
     Raises:
         UsageError: frames with so few fragments as no target leaves take longer.
     """
-    some, plain = evenly(shots, LIMIT_VIEWS), Candidate(model.untruncated())
+    some, plain = evenly_spaced(shots, LIMIT_VIEWS), Candidate(model.untruncated())
     store = ThresholdStore.from_falloff(torch.full_like(plain.splats.opacities, 0.05))
     inputs = [plain.inputs(shot.view) for shot in some]
 

@@ -18,11 +18,11 @@ from fragprune_plugins.engines import Engine
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.adam import EPSILON, stepping_fused
 from fragprune_plugins.learning.area import area_per_pixel
+from fragprune_plugins.learning.deferred import DeferredSignals, between_steps
 from fragprune_plugins.learning.events import Progress, StepStats
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.targets import Target
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.learning.waiting import Waiting, between_steps
 from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.hooks import thresholds_for
 from fragprune_plugins.plugins.loading import installed
@@ -202,7 +202,7 @@ class Training:
         """All that learns, by name."""
         return {**self.parameters(), "thresholds": self.stage.store.logits}
 
-    def _step(self, shots: Sequence[Shot], waiting: Waiting, keeper: Keeping) -> None:
+    def _step(self, shots: Sequence[Shot], waiting: DeferredSignals, keeper: Keeping) -> None:
         stage = self.stage
         stage.begin(lambda: torch.sigmoid(self.model.opacity.detach()))
         self._plain_first = not all(map(stage.knows, shots))
@@ -210,7 +210,7 @@ class Training:
             stage.picture = shot.name
             outputs, pressure = self._draw(shot)
             loss = photometric_loss(shot.looked_at(outputs.image), shot.image) / len(shots)
-            stage.lost(loss)
+            stage.on_loss(loss)
             torch.autograd.backward(loss if pressure is None else loss + pressure)
         stage.picture = ", ".join(shot.name for shot in shots)
         due = keeper.due(self.done + 1)
@@ -243,7 +243,7 @@ class Training:
             return outputs if whole else plain or self._plain(inputs)
 
         area = area_per_pixel(inputs) if self.settings.goal.on_area else None
-        return outputs, self.stage.drew(shot, outputs, untruncated, area=area)
+        return outputs, self.stage.on_drawn(shot, outputs, untruncated, area=area)
 
     @torch.no_grad()
     def _plain(self, inputs: RasterInputs) -> RasterOutputs:

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.errors import UsageError
+from fragprune_plugins.learning.deferred import DeferredSignals
 from fragprune_plugins.learning.pressure import StepViews
 from fragprune_plugins.learning.schedule import Settings, StepPlan
 from fragprune_plugins.learning.stage2 import Stage2
-from fragprune_plugins.learning.waiting import Waiting
 from fragprune_plugins.workbench.goals import Faster
 from fragprune_plugins.workbench.ranks import Ranks, fingerprint
 from fragprune_plugins.workbench.scenes.dataset import Shot
@@ -99,7 +99,7 @@ class Processes:
         stage: SharedStage,
         learned: Mapping[str, Tensor],
         shots: Sequence[Shot],
-        waiting: Waiting,
+        waiting: DeferredSignals,
         *,
         due: bool,
     ) -> None:

@@ -29,7 +29,7 @@ from fragprune_plugins.workbench.finetune.checkpoints import UNFIT
 from fragprune_plugins.workbench.finetune.loop import Training
 from fragprune_plugins.workbench.finetune.losses import code_for
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Photograph, Shot
-from fragprune_plugins.workbench.scenes.images import DOOR
+from fragprune_plugins.workbench.scenes.images import IMAGE_FILE
 
 SUFFIX = ".fragprune-unfinished"
 EVERY = 300.0
@@ -272,7 +272,7 @@ def _of(shot: Shot) -> Iterable[Tensor | str]:
 
 
 def _content(image: Path) -> str:
-    with DOOR.reading(image) as reading:
+    with IMAGE_FILE.reading(image) as reading:
         version = os.fstat(reading.file.fileno())
     return _photograph(image, version.st_mtime_ns, version.st_size)
 

@@ -10,7 +10,7 @@ from fragprune_plugins.engines import Engine
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.goals import Control, Fewer, Pressure
 from fragprune_plugins.learning.schedule import Schedule, Settings
-from fragprune_plugins.learning.stage2 import evenly
+from fragprune_plugins.learning.stage2 import evenly_spaced
 from fragprune_plugins.workbench.figures.evaluate import Candidate, psnrs
 from fragprune_plugins.workbench.finetune.loop import Training
 from fragprune_plugins.workbench.finetune.processes import Processes
@@ -111,7 +111,7 @@ def forgotten(
     if len(dataset.train) < _FEWEST:
         return None
     say(f"trying whether the model knows its photographs by heart: {STEPS} steps on half of them")
-    learned, others = dataset.train[::2], evenly(dataset.train[1::2], _VIEWS)
+    learned, others = dataset.train[::2], evenly_spaced(dataset.train[1::2], _VIEWS)
     goal = Pressure(0.0) if model.falloff is not None else Control()
     settings = Settings(iterations=STEPS, goal=goal, threshold_lr=0.0, stop=None, seed=seed)
     half, alone = replace(dataset, train=learned), Processes(Ranks())

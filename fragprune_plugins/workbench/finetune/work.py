@@ -15,7 +15,7 @@ from fragprune_plugins.files.atomic import locked
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.learning.interruption import sigterm_interrupts
-from fragprune_plugins.learning.stage2 import evenly
+from fragprune_plugins.learning.stage2 import evenly_spaced
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import OwnCameras, open_engine, photographs_for
 from fragprune_plugins.workbench.commands.options import require_several
@@ -139,7 +139,7 @@ def _tried(opened: _Opened) -> tuple[_Opened, float | None]:
 
 def _warn_of_another_scene(opened: _Opened, dataset: Dataset) -> None:
     """Warn before the learning of photographs that the model does not show."""
-    shots = evenly(dataset.train, 8)
+    shots = evenly_spaced(dataset.train, 8)
     shown = statistics.fmean(psnrs(Candidate(opened.whole), shots, opened.engine)[0])
     if shown < OTHER_SCENE:
         _say(

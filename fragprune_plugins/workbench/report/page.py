@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
 from fragprune_plugins.files.atomic import replacing
-from fragprune_plugins.learning.stage2 import evenly
+from fragprune_plugins.learning.stage2 import evenly_spaced
 from fragprune_plugins.workbench.figures import page
 from fragprune_plugins.workbench.figures.evaluate import Candidate, enlarged
 from fragprune_plugins.workbench.figures.pictures import save_image, save_map, stems
@@ -115,7 +115,7 @@ def draw_views(
         shots: the views; they move to the models' device.
         enlarge: how many times as wide and high as the photograph both models are drawn.
     """
-    chosen = [shot.to(original.model.xyz.device) for shot in evenly(shots, SHOWN)]
+    chosen = [shot.to(original.model.xyz.device) for shot in evenly_spaced(shots, SHOWN)]
     names = stems([shot.name for shot in chosen])
     maps: dict[str, dict[str, Tensor]] = {"fragments": {}, "error": {}}
     views = []

@@ -16,7 +16,7 @@ from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import DatasetError, ModelFileError, RecordError, SidecarError
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.files.reading import MEBIBYTE, Door, lies_in
+from fragprune_plugins.files.reading import MEBIBYTE, UntrustedFile, lies_in
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import OwnCameras, open_engine, own_cameras
 from fragprune_plugins.workbench.commands.options import EngineOptions
@@ -24,7 +24,7 @@ from fragprune_plugins.workbench.figures import records, wording
 from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.figures.page import Table, embedded
 from fragprune_plugins.workbench.figures.recorded import recorded
-from fragprune_plugins.workbench.figures.records import CONTROL, DOOR, Record
+from fragprune_plugins.workbench.figures.records import CONTROL, RECORD_FILE, Record
 from fragprune_plugins.workbench.goals import parse_goal
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.report import page as report_page
@@ -35,7 +35,7 @@ PAGE = "report.html"
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 
-_PICTURE = Door(RecordError, "no picture", "a PNG", "Remove it.", limit=64 * MEBIBYTE)
+_PICTURE = UntrustedFile(RecordError, "no picture", "a PNG", "Remove it.", limit=64 * MEBIBYTE)
 
 _HOW = "Name the scene with --data: then it is read, and so are the models of the record."
 
@@ -103,7 +103,7 @@ def report(*, folder: Path, out: Path | None, data: Path | None, engine: EngineO
 
 def _check(record: Record) -> None:
     """Raise RecordError if a record lacks what the page shows, or has it in other types."""
-    with DOOR.stated(record.path):
+    with RECORD_FILE.stated(record.path):
         if (goal := _goal(record)) is not None:
             parse_goal(goal)
         _table(record)
@@ -226,7 +226,7 @@ def _source(record: Record, data: Path | None) -> _Source | None:
     """The source of a record's views; ``data`` is the scene that the user named."""
     own = own_cameras(record)
     if own is not None:
-        with DOOR.stated(record.path):
+        with RECORD_FILE.stated(record.path):
             models = [
                 records.located(record.data[name], record.path.parent) for name in ("model", "out")
             ]
@@ -276,7 +276,7 @@ def _draw(
         loaded = [load(path, filtered=source.filtered, device=device) for path in allowed]
         if curves:
             values = loaded[-1].falloff if source.models[-1] in allowed else None
-            with DOOR.stated(record.path) as reading:
+            with RECORD_FILE.stated(record.path) as reading:
                 reading.place = "data.curves"
                 report_page.save_learning(folder / report_page.LEARNING, curves, values)
             learning = [("How it learned", report_page.LEARNING)]

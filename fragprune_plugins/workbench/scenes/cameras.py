@@ -17,7 +17,7 @@ from typing import Any
 import torch
 
 from fragprune_plugins.errors import DatasetError
-from fragprune_plugins.files.reading import Door
+from fragprune_plugins.files.reading import UntrustedFile
 from fragprune_plugins.hosts.photographs import Resolution
 from fragprune_plugins.types import View
 from fragprune_plugins.workbench.scenes.dataset import read_scene
@@ -29,7 +29,7 @@ from fragprune_plugins.workbench.scenes.transforms import (
     read_transforms,
 )
 
-_CAMERAS = Door(
+_CAMERAS = UntrustedFile(
     DatasetError,
     "not a cameras file",
     "cameras.json of a 3DGS model, or a transforms file",

@@ -14,14 +14,14 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from fragprune_plugins.errors import DatasetError
-from fragprune_plugins.files.reading import Door, Reading
+from fragprune_plugins.files.reading import Reading, UntrustedFile
 from fragprune_plugins.workbench.scenes.images import find_image
 from fragprune_plugins.workbench.scenes.lenses import Lens
 from fragprune_plugins.workbench.scenes.posed import Posed, split
 
 NERFSTUDIOS = Path("colmap", "sparse", "0")
 
-_DOOR = Door(
+_FILE = UntrustedFile(
     DatasetError,
     "cut off or not COLMAP's",
     "COLMAP's cameras and images files, complete",
@@ -76,10 +76,10 @@ def read(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]
     else:
         found = model / "cameras.txt", model / "images.txt"
         parsers = _cameras_text, _images_text
-    with _DOOR.reading(found[0]) as reading:
+    with _FILE.reading(found[0]) as reading:
         cameras = dict(parsers[0](reading))
     rows = []
-    with _DOOR.reading(found[1]) as reading:
+    with _FILE.reading(found[1]) as reading:
         for name, camera_id, quaternion, translation in parsers[1](reading):
             if camera_id not in cameras:
                 raise DatasetError(

@@ -81,7 +81,7 @@ ROOM = 4096 * MEBIBYTE
 """Bytes of pixels that are kept: 170 photographs of 3840x2160 pixels."""
 
 
-class Slot:
+class PixelSlot:
     """The place of one photograph's pixels, shared by its copies on other devices."""
 
 
@@ -94,14 +94,14 @@ class Pictures:
 
     def __init__(self, room: int) -> None:
         self.room = room
-        self._held: weakref.WeakKeyDictionary[Slot, Tensor] = weakref.WeakKeyDictionary()
+        self._held: weakref.WeakKeyDictionary[PixelSlot, Tensor] = weakref.WeakKeyDictionary()
 
     @property
     def size(self) -> int:
         """Bytes of all pixels that are kept."""
         return sum(pixels.numel() for pixels in self._held.values())
 
-    def get(self, slot: Slot, load: Callable[[], Tensor]) -> Tensor:
+    def get(self, slot: PixelSlot, load: Callable[[], Tensor]) -> Tensor:
         """The slot's pixels, loaded if they are not there."""
         known = self._held.pop(slot, None)
         self._held[slot] = pixels = load() if known is None else known  # the last one in the order
@@ -137,7 +137,7 @@ class Photograph(Shot):
     camera: Camera | None = None
     lens: Lens | None = None
     mask: Path | None = None
-    _pixels: Slot = field(default_factory=Slot, repr=False)
+    _pixels: PixelSlot = field(default_factory=PixelSlot, repr=False)
 
     __repr__ = one_line
 

@@ -11,7 +11,7 @@ from PIL import Image
 
 from fragprune_plugins.constants import SIDE_MAX
 from fragprune_plugins.errors import DatasetError
-from fragprune_plugins.files.reading import Door
+from fragprune_plugins.files.reading import UntrustedFile
 
 PIXELS_MAX = 160_000_000
 """Most pixels of a photograph; cameras reach 151 million. Pillow itself refuses 179 million."""
@@ -22,7 +22,7 @@ _FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 _CUT = ("I", "F")
 """Modes besides 16-bit grey whose values Pillow cuts at 255: a bright photograph is white then."""
 
-DOOR = Door(
+IMAGE_FILE = UntrustedFile(
     DatasetError,
     "not readable",
     "a PNG or JPEG image",
@@ -62,7 +62,7 @@ def opened(path: Path) -> Iterator[Image.Image]:
     Raises:
         DatasetError: the file is missing, no image, or too large; or the block raised.
     """
-    with DOOR.reading(path) as reading, warnings.catch_warnings():
+    with IMAGE_FILE.reading(path) as reading, warnings.catch_warnings():
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # PIXELS_MAX decides
         with Image.open(reading.file, formats=_FORMATS) as image:
             width, height = image.size

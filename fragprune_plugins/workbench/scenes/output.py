@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from fragprune_plugins.errors import DatasetError, ModelFileError, printable
-from fragprune_plugins.files.reading import MEBIBYTE, Door
+from fragprune_plugins.files.reading import MEBIBYTE, UntrustedFile
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.hosts.source import parsed
 
@@ -22,7 +22,7 @@ ARGUMENTS, CAMERAS = "cfg_args", "cameras.json"
 
 _DIVISORS = (1, 2, 4, 8)  # of -r; other numbers are widths
 
-_DOOR = Door(
+_FILE = UntrustedFile(
     DatasetError,
     "not the arguments of a training",
     "Namespace(source_path=..., ...), as a 3DGS host writes it",
@@ -75,7 +75,7 @@ def trained_on(model: Path) -> Photographs | None:
     folder = output_folder(model)
     if folder is None or not (folder / ARGUMENTS).exists():
         return None
-    with _DOOR.reading(folder / ARGUMENTS) as reading:
+    with _FILE.reading(folder / ARGUMENTS) as reading:
         call = _call(reading.text())
         values: dict[str, Any] = {}
         for word in call.keywords:

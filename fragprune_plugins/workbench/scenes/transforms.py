@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from fragprune_plugins.errors import DatasetError
-from fragprune_plugins.files.reading import MEBIBYTE, Door
+from fragprune_plugins.files.reading import MEBIBYTE, UntrustedFile
 from fragprune_plugins.workbench.scenes.images import find_image, image_size
 from fragprune_plugins.workbench.scenes.lenses import Lens
 from fragprune_plugins.workbench.scenes.posed import Posed, split
@@ -24,14 +24,14 @@ _FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 JSON_MAX = 32 * MEBIBYTE
 """Ten thousand frames of nerfstudio take 11 to 13 MiB, of a ``cameras.json`` 4."""
 
-_JSON = Door(
+_JSON = UntrustedFile(
     DatasetError,
     "not readable as JSON",
     "a JSON file of cameras",
     "Save it again.",
     limit=JSON_MAX,
 )
-_TRANSFORMS = Door(
+_TRANSFORMS = UntrustedFile(
     DatasetError,
     "not a transforms file",
     "frames with file_path and transform_matrix, and camera_angle_x or fl_x",

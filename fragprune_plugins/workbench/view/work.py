@@ -99,7 +99,7 @@ def _original(model: Path) -> Path | None:
     record = records.beside(model)
     if record is None:
         return None
-    with records.DOOR.stated(record.path):
+    with records.RECORD_FILE.stated(record.path):
         name = record.data.get("model_before", record.data.get("model"))
         original = None if name is None else records.located(name, record.path.parent)
     inside = output_folder(model) or model.parent  # a record may be somebody else's

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 from fragprune_plugins.errors import ModelFileError, OutputError, PluginError
-from fragprune_plugins.files.reading import Door, Reading
+from fragprune_plugins.files.reading import Reading, UntrustedFile
 from fragprune_plugins.plugins.points import load, offered
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ SUFFIXES = (".ply", *(f".{name}" for name in offered(GROUP)))
 ENDINGS = tuple(dict.fromkeys(Path(f"model{each}").suffix for each in SUFFIXES))
 """The last suffixes of such names; that of a compressed PLY is .ply."""
 
-_DOOR = Door(
+_FILE = UntrustedFile(
     ModelFileError,
     "not readable",
     "a complete trained splat",
@@ -118,7 +118,7 @@ def read(path: Path, *, filtered: bool = False) -> Model:
     form = found(path)
     if form.paired:
         return read_ply(path, filtered=filtered)
-    with _DOOR.reading(path) as reading:
+    with _FILE.reading(path) as reading:
         model = form.read(reading)
         expect_drawable(path, model)
         return model

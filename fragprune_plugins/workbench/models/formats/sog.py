@@ -22,7 +22,7 @@ from PIL import Image
 from fragprune_plugins.constants import VERSION
 from fragprune_plugins.errors import ModelFileError
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.files.reading import MEBIBYTE, Door, Reading, parse_json
+from fragprune_plugins.files.reading import MEBIBYTE, Reading, UntrustedFile, parse_json
 from fragprune_plugins.workbench.models.formats import Format, arrays
 from fragprune_plugins.workbench.models.formats.palette import codebook, nearest, palette
 
@@ -35,7 +35,9 @@ _SIDE_MAX = 16383  # of a WebP
 _COEFFICIENTS = (0, 3, 8, 15)
 _PALETTE = 64  # entries in a row of the image of SH
 _SQRT2 = 2**0.5
-_DOOR = Door(ModelFileError, "not readable as WebP", "an image of a SOG", "Copy the model again.")
+_FILE = UntrustedFile(
+    ModelFileError, "not readable as WebP", "an image of a SOG", "Copy the model again."
+)
 
 Load = Callable[[str], bytes]
 
@@ -71,7 +73,7 @@ def _beside(reading: Reading) -> Load:
     def load(name: str) -> bytes:
         if Path(name).name != name:
             raise ValueError(f"an image at {name[:80]!r}")
-        with _DOOR.reading(reading.path.parent / name) as image:
+        with _FILE.reading(reading.path.parent / name) as image:
             return image.take(image.size)
 
     return load

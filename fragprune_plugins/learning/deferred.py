@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 
 
-class Waiting:
+class DeferredSignals:
     """Signals that wait for the end of a step. Called, it lets the last of them act."""
 
     def __init__(self, handlers: dict[int, Callable[[int, FrameType | None], object]]) -> None:
@@ -38,7 +38,7 @@ class Waiting:
 
 
 @contextlib.contextmanager
-def between_steps() -> Iterator[Waiting]:
+def between_steps() -> Iterator[DeferredSignals]:
     """Inside, Ctrl-C and SIGTERM wait until the yielded object is called, between two steps.
 
     So what is kept then is the state after a whole step. A second signal does not wait. Outside the
@@ -47,7 +47,7 @@ def between_steps() -> Iterator[Waiting]:
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     main = threading.current_thread() is threading.main_thread()
     known = {int(n): each for n, each in before.items() if main and callable(each)}
-    waiting = Waiting(known)
+    waiting = DeferredSignals(known)
     take = waiting.take  # one object, to be known again
     for number in known:
         signal.signal(number, take)
