@@ -398,6 +398,31 @@ def _trainings(fork: Fork, module: str) -> tuple[str, str] | None:
     return places, "one, by which steps are counted"
 
 
+def _bound_at_first(tree: ast.Module) -> tuple[str, str] | None:
+    """A name that a function binds only in its first iterations, and where; it reads it later."""
+    for function in every(tree, ast.FunctionDef):
+        early = dict[ast.AST, str]()
+        for node in every(function, ast.If):
+            if re.fullmatch(r"iteration (<|<=|==) \d+", test := ast.unparse(node.test)):
+                early |= {inner: test for each in node.body for inner in nodes(each)}
+        bound = [(name, node) for node in nodes(function) for name in _binds(node)]
+        first = {name: early[node] for name, node in bound if node in early}
+        later = {name for name, node in bound if node not in early}
+        for name in every(function, ast.Name):
+            if name.id in first.keys() - later and name not in early:
+                return name.id, first[name.id]
+    return None
+
+
+def _binds(node: ast.AST) -> list[str]:
+    """Names that a node of a function binds."""
+    if isinstance(node, ast.Import | ast.ImportFrom):
+        return [(each.asname or each.name).split(".")[0] for each in node.names]
+    if isinstance(node, ast.arg):
+        return [node.arg]
+    return [node.id] if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) else []
+
+
 def _not_resumed(repo: HostRepo, script: str, tree: ast.Module) -> str:
     """Why a script cannot resume its own training, or we not read its checkpoints; "" if it can."""
     missing = [name for name in ("capture", "restore") if name not in _mentioned(tree)]
@@ -412,6 +437,8 @@ def _not_resumed(repo: HostRepo, script: str, tree: ast.Module) -> str:
     kept = [each for each in saved if "capture()" in ast.unparse(each)]
     if not any(isinstance(each, ast.Tuple) and len(each.elts) == 2 for each in kept):
         return f"{script} has checkpoints that are not its model and the iteration"
+    if bound := _bound_at_first(tree):
+        return f"{script} makes {bound[0]} only where {bound[1]}"
     made = every(tree, ast.Assign)
     assigned = [(node, ast.unparse(target)) for node in made for target in node.targets]
     read = {

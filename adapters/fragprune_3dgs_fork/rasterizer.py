@@ -96,8 +96,11 @@ def meaning(repo: HostRepo, call: graphdeco.CallInSource, name: str) -> Output:
                 return Output(name, each, detached=flat)  # type: ignore[arg-type]
     elif re.search(r"alpha|acc|opac", name) and _written(text, name, "alpha|opac", weights):
         return Output(name, "alpha", detached=flat)
-    elif blended and moved is not None and _words(name) & _words(_blended(text)):
-        return Output(name, "objects", detached=not moved)
+    elif blended and moved is not None:
+        images = set(re.findall(r"\bout_(\w+)\[[^]]*\]=", text))
+        alone = len(call.names) == 3 and images <= {"color", _blended(text)}
+        if alone or _words(name) & _words(_blended(text)):
+            return Output(name, "objects", detached=not moved)
     return Output(name, "unread")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import runpy
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +15,25 @@ GROUPS = ("OptimizationParams", "ModelHiddenParams", "ModelParams", "PipelinePar
 class PythonFile(ConfigFile):
     """A Python file that assigns dicts, and may name files in ``_base_`` that it builds on.
 
-    The host's own reader is used, which runs the file as the host does.
+    It is run, as the host does: with mmcv 1, and its forks with mmengine or a reader of their own.
     """
 
     def read(self, path: Path) -> dict[str, Any]:
         """Values by argument name."""
-        from mmcv import Config
-
-        config = Config.fromfile(str(path))
-        groups = (config[name] for name in GROUPS if name in config)
-        return {key: value for group in groups for key, value in group.items()}
+        groups = _groups(path)
+        return {key: value for name in GROUPS for key, value in groups.get(name, {}).items()}
 
     def copied(self, path: Path, values: dict[str, Any]) -> str:
         """A file that builds on the given one, and has the new values in the group that wins."""
         return f"_base_ = [{str(path.resolve())!r}]\n{GROUPS[-1]} = {values!r}\n"
+
+
+def _groups(path: Path) -> dict[str, dict[str, Any]]:
+    """The dicts of a file over those of the files that it builds on."""
+    own = runpy.run_path(str(path))
+    bases = own.get("_base_", [])
+    paths = [bases] if isinstance(bases, str) else bases
+    groups: dict[str, dict[str, Any]] = {}
+    for each in [*(_groups(path.parent / base) for base in paths), own]:
+        groups |= {name: groups.get(name, {}) | each[name] for name in GROUPS if name in each}
+    return groups

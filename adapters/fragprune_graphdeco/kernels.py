@@ -5,6 +5,7 @@ The import name of a rasterizer proves nothing: forks keep it and change the ker
 
 from __future__ import annotations
 
+import ast
 import os
 import re
 from collections.abc import Iterator
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import Literal
 from weakref import WeakKeyDictionary
 
-from fragprune_plugins.adapting import Finding, HostRepo
+from fragprune_plugins.adapting import Finding, HostRepo, nodes
 
 _DEEPEST = 6
 """Folders below the checkout in which a rasterizer is looked for."""
@@ -110,14 +111,23 @@ def _projects(repo: HostRepo, package: str) -> list[_Project]:
 
 
 def vendored(repo: HostRepo, package: str) -> list[Path]:
-    """Folders of a checkout that contain the package's import folder and CUDA sources."""
+    """Folders of a checkout that contain the package's import folder and CUDA sources, or that a
+    file of this name has torch compile when it is imported.
+    """
     if repo.package:
         return []
     name = package.rpartition(".")[2]
+    calls = (each for each in nodes(repo.tree(package)) if isinstance(each, ast.Call))
+    loads = [each for each in calls if any(word.arg == "sources" for word in each.keywords)]
+    tree = repo.tree(package) if loads else None
+    texts = (str(each.value) for each in nodes(tree) if isinstance(each, ast.Constant))
+    named = [each for each in texts if each.endswith(".cu")]
     return [
         folder
         for folder, inside in _folders(repo.root)
-        if name in inside and (folder / name / "__init__.py").is_file() and any(_sources(folder))
+        if (name in inside and (folder / name / "__init__.py").is_file())
+        or any((folder / each).is_file() for each in named)
+        if any(_sources(folder))
     ]
 
 

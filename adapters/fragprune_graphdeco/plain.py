@@ -77,8 +77,9 @@ def read_models(repo: HostRepo) -> list[Plain]:
     own, models = read_plain(repo), []
     for each in (name for name in names if "/." not in f"/{name}"):
         model = read_plain(HostRepo(repo.root / each))
-        reasons = tuple(why for why in model.reasons if not saved or why != _UNSAVED)
-        models.append(replace(model, folder=each, reasons=reasons))
+        reasons = [why for why in model.reasons if not saved or why != _UNSAVED]
+        reasons += _moved(HostRepo(repo.root / each), repo)
+        models.append(replace(model, folder=each, reasons=tuple(reasons)))
     beside = not _own_renderers(repo) and any(each.model for each in models)
     if beside:  # what was found by itself is that of a folder
         own = Plain(own.reasons or (_ABSENT,))
@@ -112,6 +113,7 @@ def _read_plain(repo: HostRepo) -> Plain:
         *_of_columns(repo, module, name),
         *(() if flat else _of_kernel(repo)),
         *drawn,
+        *_moved(repo, repo),
         *_of_saving(repo, module, name),
         *_of_positions(repo, module, name),
         *_of_others(repo, module, name),
@@ -384,6 +386,21 @@ def _of_drawing(repo: HostRepo, modules: Iterable[str]) -> Iterator[tuple[str, b
             return
 
 
+def _moved(repo: HostRepo, callers: HostRepo) -> Iterator[str]:
+    """Shapes that ``render`` makes of arguments which are off, but which files of a folder give."""
+    texts = _scripts(callers).items()
+    for module, function in ((m, f) for m in _renderers(repo)[:1] for f in _drawing(repo, m)[:1]):
+        paths = [path for path, text in texts if f"{function.name}(" in text]
+        names = (reading.module_of(each.relative_to(callers.root).as_posix()) for each in paths)
+        words = (
+            w for each in names for c in callers.calls(each, function.name) for w in c.keywords
+        )
+        given = {w.arg or "" for w in words if not is_off(w.value)} & off_by_default(function)
+        for why, _ in Drawing(repo, module, function, on=given).shapes() if given else ():
+            if re.search(rf"from ([\w.]+, )*({'|'.join(sorted(given))}),", why):
+                yield why
+
+
 def _drawing(repo: HostRepo, module: str) -> list[ast.FunctionDef]:
     """The functions of a module that draw, ``render`` first, then those that return a picture."""
     body = getattr(repo.tree(module), "body", ())
@@ -460,6 +477,7 @@ class Drawing:
         drawn_from: attributes of the model, and arguments, that it may draw besides those of
             plain 3DGS.
         call: the one that draws; by default that whose picture it returns.
+        on: arguments that are given, though they are off by default.
 
     Attributes:
         colours: options, off by default, under which something else makes the colours.
@@ -472,12 +490,14 @@ class Drawing:
         function: Function,
         drawn_from: Collection[str] = (),
         call: ast.Call | None = None,
+        on: Collection[str] = (),
     ) -> None:
         self.repo, self.module, self.function = repo, module, function
         self.drawn_from = drawn_from
         arguments = function.args
         taken = [*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs]
-        self.parameters, self.off = {each.arg for each in taken}, off_by_default(function)
+        self.parameters = {each.arg for each in taken}
+        self.off = off_by_default(function) - {*on}
         given = zip(reversed(arguments.args), reversed(arguments.defaults), strict=False)
         self.switches = {
             each.arg for each, v in given if isinstance(getattr(v, "value", None), bool)

@@ -149,7 +149,8 @@ def failing(repo: HostRepo, scripts: Collection[str]) -> list[str]:
             if any("torch.compile" in ast.unparse(each) for each in node.decorator_list)
             and any(getattr(each, "attr", "") == "backward" for each in nodes(node))
         ]
-        found += (_misfits(repo, module_of(script)) + _absent(repo, module_of(script)))[:1]
+        module = module_of(script)
+        found += (*_misfits(repo, module), *_absent(repo, module), *_own_folders(repo, module))[:1]
     return found
 
 
@@ -198,6 +199,20 @@ def _misfits(repo: HostRepo, module: str) -> tuple[str, ...]:
         if why := _misfit(found, node, bool(owner)):
             misfits += (f"its call of {name} {why}, which fails ({at})",)
     return misfits
+
+
+def _own_folders(repo: HostRepo, module: str) -> Iterator[str]:
+    """Folders of data and output that a script sets itself, whatever its command says."""
+    body = getattr(repo.tree(module), "body", ())
+    main = [node.body for node in body if isinstance(node, ast.If) and "__name__" in _test(node)]
+    for node in (each for part in (body, *main) for each in part if isinstance(each, ast.Assign)):
+        name = getattr(node.targets[0], "attr", "")
+        if name in ("source_path", "model_path") and f".{name}" not in ast.unparse(node.value):
+            yield f"sets {name} itself, whatever its command says ({repo.at(module, node.lineno)})"
+
+
+def _test(node: ast.If) -> str:
+    return ast.unparse(node.test)
 
 
 _ANY = "any key"

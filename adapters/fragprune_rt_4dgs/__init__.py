@@ -8,13 +8,17 @@ thresholds.
 
 from __future__ import annotations
 
+import ast
+import re
 from argparse import ArgumentParser
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fragprune_graphdeco import GraphdecoAdapter, RasterizerCall
+from fragprune_graphdeco import MODEL, GraphdecoAdapter, RasterizerCall
 from fragprune_plugins.adapting import (
+    Finding,
     HostInfo,
+    HostRepo,
     ParamGroup,
     SeamCall,
     UsageError,
@@ -25,6 +29,9 @@ from fragprune_rt_4dgs.dialect import ARGUMENTS, OUTPUTS, RASTERIZER, SETTINGS, 
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+ROTATIONS = "utils.general_utils"
+"""Where the host makes 4D rotations."""
 
 
 def with_its_map(call: SeamCall) -> Any:
@@ -90,6 +97,23 @@ class RT4DGS(GraphdecoAdapter):
             "GaussianModel.load_ply": None,
         },
     )
+
+    # -- its source ------------------------------------------------------------------------------
+
+    def fingerprint(self, repo: HostRepo) -> list[Finding]:
+        """Also that 4D rotations have their axes turned round, as the host does since late 2024.
+
+        What it drew before is another picture of the same numbers.
+        """
+        texts = [ast.unparse(repo.tree(each) or ast.Pass()) for each in (MODEL, ROTATIONS)]
+        found = super().fingerprint(repo)
+        if not any(map(re.compile(r"\bflip\([^()]*1, 2").search, texts)):
+            older, at = (
+                "4D rotations whose axes are not turned round",
+                (ROTATIONS, "build_rotation_4d"),
+            )
+            found.append(Finding.error("rotations", repo.place(*at), older, "flip(1, 2) of them"))
+        return found
 
     # -- its command line ------------------------------------------------------------------------
 

@@ -156,10 +156,11 @@ def _own(roots: list[HostRepo], name: str) -> list[Module]:
 
 
 def _inside(repo: HostRepo, package: str) -> bool:
-    """Whether a checkout has a package in any folder, because hosts extend the path."""
+    """Whether a checkout has a package in any folder, since hosts extend the path, or a folder."""
     files = (f"{package}.py", f"{package}/__init__.py")
     try:
-        return not repo.package and any(True for file in files for _ in repo.root.rglob(file))
+        found = (repo.root / package).is_dir() or any(map(any, map(repo.root.rglob, files)))
+        return found and not repo.package
     except OSError:  # too long a name for a file
         return False
 

@@ -78,9 +78,8 @@ class HostCommand:
     def with_flags(self, scratch: Path, **extra: Any) -> list[str]:
         """Arguments with flags appended; argparse takes the last value of a flag.
 
-        A host's configuration file overrides flags. If the command names one, a changed copy
-        replaces it. The flags are appended as well, because a host may read the iterations to save
-        at before it reads the file.
+        A host's configuration file overrides flags, so a changed copy replaces it. The flags are
+        appended as well, since a host may read the iterations to save at before it reads the file.
 
         Args:
             scratch: folder for that copy.

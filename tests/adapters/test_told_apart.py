@@ -25,6 +25,7 @@ MODEL = "scene/gaussian_model.py"
         ("rain-gs", RENDERER, "low_pass=low_pass,\n", "", "takes what hosts share"),
         ("rain-gs", MODEL, "divide_ratio", "ratio", "no divide_ratio"),
         ("rain-gs", "scene/__init__.py", "args_dict", "options", "no args_dict"),
+        ("rt-4dgs", MODEL, ".flip(1, 2)", "", "axes are not turned round"),
     ],
 )
 def test_a_changed_host_is_refused_by_what_changed(adapter, file, old, new, found, tmp_path):

@@ -197,6 +197,11 @@ def test_blended_channels_are_known_by_argument_and_kernel(tmp_path, name):
     assert errors(known) == []
     assert ForkAdapter().dialect(known).fork.blended == {"diff_gaussian_rasterization": name}
     assert errors(fork(tmp_path / "unknown", used, **given))
+    alone = {"values": "image, radii, features", "arguments": f", {name}=pc.get_objects"}
+    features = USED[0], USED[1].format("features")
+    assert errors(fork(tmp_path / "alone", features, **alone, kernel=OBJECTS)) == []
+    two = f"{OBJECTS} out_depth[pix_id] = D;"
+    assert errors(fork(tmp_path / "two", features, **alone, kernel=two))
     lit = OBJECTS.replace("= O[ch]", "= O[ch] + T * bg[ch]")
     assert errors(fork(tmp_path / "lit", used, **given, kernel=lit))
     made = "    objects = pc.get_objects if pipe.seen else torch.zeros((1,))\n    rasterizer ="
@@ -575,6 +580,11 @@ NOT_RESUMED = {
     ),
     "a lost network": ('"params": [self.poses]', '"params": self.net.parameters()'),
     "a whole network": ('"params": [self.poses]', '"params": self.poses.parameters()'),
+    "an import in its first iterations": (
+        "\n        loss.backward()",
+        "\n        if iteration < 4:\n            import cv2\n        loss.backward()"
+        "\n        cv2.imwrite(name, image)",
+    ),
     "several models": (
         "gaussians = GaussianModel(3)",
         "gaussians, b = GaussianModel(3), GaussianModel(3)",
@@ -600,7 +610,31 @@ def test_stage_two_follows_in_one_run_where_a_script_cannot_resume(tmp_path, wha
 
 
 def test_a_script_that_can_resume_does(tmp_path):
+    early = (
+        "\n        if iteration < 4:\n            import cv2\n            cv2.imwrite(name, image)"
+    )
+    both = f"{early}\n        import cv2\n        loss.backward()\n        cv2.imwrite(name, image)"
     assert not ForkAdapter().command_line(fork(tmp_path)).one_run
+    for inside in (f"{early}\n        loss.backward()", both):
+        repo = fork(tmp_path, ("\n        loss.backward()", inside))
+        assert not ForkAdapter().command_line(repo).one_run
+
+
+OVERRULES = {
+    "a folder of its own": ("args.source_path = '/data/mine'", False),
+    "a folder by a name of its own": ("args.model_path = os.path.join('out', now())", False),
+    "the same, whole": ("args.source_path = os.path.abspath(args.source_path)", True),
+    "another option": ("args.images = 'images_4'", True),
+    "where none is given": ("if not args.model_path:\n        args.model_path = 'out'", True),
+}
+
+
+@pytest.mark.parametrize("what", OVERRULES)
+def test_a_script_that_overrules_the_folders_of_its_command_is_refused(tmp_path, what):
+    sets, served = OVERRULES[what]
+    main = f"\nif __name__ == '__main__':\n    {sets}\n\ndef read_flags"
+    found = errors(fork(tmp_path, ("\ndef read_flags", main)))
+    assert found == [] if served else "itself, whatever its command says" in found[0]
 
 
 MOVED = [

@@ -81,7 +81,8 @@ def test_what_we_answer_counts_as_there_and_is_not_looked_into(tmp_path):
 def test_what_the_checkout_holds_somewhere_is_the_hosts_to_find(tmp_path):
     """Hosts put folders of theirs on the path."""
     files = {
-        "train.py": "import sys\nsys.path.append('extern/lib')\nimport vendored_a, vendored_b",
+        "train.py": "import sys\nsys.path.append('extern/lib')\n"
+        "import extern, vendored_a, vendored_b",
         "extern/lib/vendored_a.py": "",
         "extern/lib/vendored_b/__init__.py": "",
     }

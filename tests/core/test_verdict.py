@@ -104,6 +104,10 @@ JOINED = """    colours = torch.clamp(pc.get_features, 0)
     return {"render": image}
 """
 
+MOVES = """    means3D = pc.get_xyz
+    if dx is not None:
+        means3D = pc.get_xyz + dx
+"""
 ASKED = """    opacity = pc.get_opacity
     if getattr(pc, "hidden", None) is not None:
         opacity = opacity * pc.hidden
@@ -494,6 +498,17 @@ def test_a_model_in_a_folder_may_be_saved_by_a_script_above(fork, tmp_path):
     assert judged(HostRepo(tmp_path)).reason == "inner/: none of its scripts saves a PLY"
     (tmp_path / "slam.py").write_text(saving)
     assert judged(HostRepo(tmp_path)).kind == "finetune"
+
+
+@pytest.mark.parametrize(("given", "kind"), [("None", "finetune"), ("dx", "never")])
+@pytest.mark.parametrize("inner", ["", "inner"])
+def test_an_argument_that_moves_gaussians_is_off_only_if_no_file_gives_it(
+    fork, tmp_path, inner, given, kind
+):
+    moved = "    means3D = pc.get_xyz\n", MOVES
+    fork(("override_color=None):", "override_color=None, dx=None):"), moved, root=tmp_path / inner)
+    (tmp_path / "slam.py").write_text(f"package = render(camera, model, pipe, bg, dx={given})\n")
+    assert judged(HostRepo(tmp_path)).kind == kind
 
 
 def test_a_model_beside_the_codebase_that_draws_does_not_count(fork, tmp_path):

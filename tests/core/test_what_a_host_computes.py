@@ -4,6 +4,7 @@ import pytest
 from miniatures.skeletons import skeleton
 
 from fragprune_2dgs import SurfelSplatting
+from fragprune_graphdeco.kernels import SPLAT, read_kernels, vendored
 from fragprune_plugins.errors import UnknownHostError
 from fragprune_plugins.hosts.choosing import locate
 from fragprune_plugins.hosts.source import HostRepo
@@ -62,6 +63,19 @@ NORMAL = EWA.replace("0, 0, 0);", "p.x / l, p.y / l, p.z / l);")
 def test_a_vendored_rasterizer_that_draws_by_the_known_rule_fits(tmp_path, projection):
     vendor(tmp_path, projection)
     assert not errors(skeleton(tmp_path))
+
+
+@pytest.mark.parametrize("projection", [EWA, TANGENT], ids=["known", "another"])
+def test_sources_that_a_file_compiles_at_import_are_read_too(tmp_path, projection):
+    vendor(tmp_path, projection, folder="kernels", package="of_another_name")
+    repo = skeleton(tmp_path)
+    (tmp_path / f"{PACKAGE}.py").write_text(
+        "folder = os.path.join(here, 'submodules', 'kernels')\n"
+        "_C = load(name='drawing', sources=[os.path.join(folder, 'cuda/forward.cu')])\n"
+    )
+    assert bool(errors(repo)) == (projection == TANGENT)
+    assert bool(read_kernels(repo, PACKAGE, SPLAT)) == (projection == TANGENT)
+    assert vendored(repo, PACKAGE) == [tmp_path / "submodules/kernels"]
 
 
 def test_gaussians_in_another_order_are_another_picture(tmp_path):
