@@ -78,7 +78,7 @@ def read_models(repo: HostRepo) -> list[Plain]:
     for each in (name for name in names if "/." not in f"/{name}"):
         model = read_plain(HostRepo(repo.root / each))
         reasons = [why for why in model.reasons if not saved or why != _UNSAVED]
-        reasons += _moved(HostRepo(repo.root / each), repo)
+        reasons += dict(_moved(HostRepo(repo.root / each), repo))
         models.append(replace(model, folder=each, reasons=tuple(reasons)))
     beside = not _own_renderers(repo) and any(each.model for each in models)
     if beside:  # what was found by itself is that of a folder
@@ -102,7 +102,7 @@ def _read_plain(repo: HostRepo) -> Plain:
         own = dict(_of_drawing(repo, _own_renderers(repo)))
         return Plain((*own, _without(repo)))
     flat = list(_scales(repo, module, name))
-    moving = dict(_of_drawing(repo, _renderers(repo)))
+    moving = dict([*_of_drawing(repo, _renderers(repo)), *_moved(repo, repo)])
     drawn = list(moving)
     made = [each for each in drawn if "3D_filter" not in each]
     moving |= (getters := dict(_of_getters(repo, module, name)))
@@ -113,7 +113,6 @@ def _read_plain(repo: HostRepo) -> Plain:
         *_of_columns(repo, module, name),
         *(() if flat else _of_kernel(repo)),
         *drawn,
-        *_moved(repo, repo),
         *_of_saving(repo, module, name),
         *_of_positions(repo, module, name),
         *_of_others(repo, module, name),
@@ -149,7 +148,9 @@ def _models(repo: HostRepo) -> Iterator[tuple[str, str]]:
     files.sort(key=lambda stem: stem != home)
     own = [f"scene.{each}" for each in files if each.isidentifier()]
     found = [*_saving(repo, own, "save_ply")]
-    yield from found or _saving(repo, _trained(repo), "save_ply", "training_setup")
+    trained = _trained(repo) if not found else []
+    setups = [*_saving(repo, trained, "save_ply", "training_setup")]
+    yield from found or setups or _saving(repo, trained, "save_ply", "get_xyz")
 
 
 def _saving(repo: HostRepo, modules: Iterable[str], *methods: str) -> Iterator[tuple[str, str]]:
@@ -284,7 +285,9 @@ def _of_positions(repo: HostRepo, module: str, name: str) -> Iterator[str]:
     """Positions that no optimizer moves: something else makes them for every picture."""
     setup = repo.function(module, f"{name}.training_setup")
     trained = " ".join(map(ast.unparse, reading.entries(setup, "params")))
-    if "self._opacity" in trained and not re.search(r"self\._xyz\b", trained):
+    created = ast.unparse(repo.function(module, f"{name}.create_from_pcd") or ast.Pass())
+    fixed = re.search(r"self\._xyz = .*requires_grad_\(False\)", created)
+    if "self._opacity" in trained and not (fixed or re.search(r"self\._xyz\b", trained)):
         at = repo.place(module, f"{name}.training_setup")
         yield f"its optimizer does not train positions, which are made otherwise ({at})"
 
@@ -386,8 +389,10 @@ def _of_drawing(repo: HostRepo, modules: Iterable[str]) -> Iterator[tuple[str, b
             return
 
 
-def _moved(repo: HostRepo, callers: HostRepo) -> Iterator[str]:
-    """Shapes that ``render`` makes of arguments which are off, but which files of a folder give."""
+def _moved(repo: HostRepo, callers: HostRepo) -> Iterator[tuple[str, bool]]:
+    """Shapes that ``render`` makes of arguments which are off, but which files of a folder give,
+    and whether its rows are drawn all the same.
+    """
     texts = _scripts(callers).items()
     for module, function in ((m, f) for m in _renderers(repo)[:1] for f in _drawing(repo, m)[:1]):
         paths = [path for path, text in texts if f"{function.name}(" in text]
@@ -396,9 +401,9 @@ def _moved(repo: HostRepo, callers: HostRepo) -> Iterator[str]:
             w for each in names for c in callers.calls(each, function.name) for w in c.keywords
         )
         given = {w.arg or "" for w in words if not is_off(w.value)} & off_by_default(function)
-        for why, _ in Drawing(repo, module, function, on=given).shapes() if given else ():
+        for why, kept in Drawing(repo, module, function, on=given).shapes() if given else ():
             if re.search(rf"from ([\w.]+, )*({'|'.join(sorted(given))}),", why):
-                yield why
+                yield why, kept
 
 
 def _drawing(repo: HostRepo, module: str) -> list[ast.FunctionDef]:

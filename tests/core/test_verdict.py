@@ -350,6 +350,13 @@ def test_what_leaves_the_picture_alone_is_plain(fork, old, new):
     assert read_plain(fork((old, new)))
 
 
+def test_positions_that_stand_still_are_no_others(fork):
+    stands = "        self._xyz = nn.Parameter(points.requires_grad_(False))\n"
+    trained = ("{'params': [], 'name': 'f_dc'}", "{'params': [self._opacity]}")
+    at = "        scales = torch.log(distances)"
+    assert read_plain(fork(trained, (at, stands + at)))
+
+
 @pytest.mark.parametrize("value", ["self.get_opacity", "self.get_opacity * self.rain"])
 def test_a_method_that_gives_getters_alone_is_plain(fork, value):
     changes = (
@@ -414,8 +421,9 @@ def test_what_is_never_saved_or_drawn_is_not_plain(fork, tmp_path):
     ("drawn", "kind", "reason"),
     [("pc.get_xyz", "finetune", ""), ("pc.net(t)", "never", "render makes means3D from pc.net")],
 )
-def test_model_and_drawing_are_found_in_any_package(fork, tmp_path, drawn, kind, reason):
-    fork(("means3D = pc.get_xyz", f"means3D = {drawn}"))
+@pytest.mark.parametrize("setup", ["training_setup", "by_another_name"])
+def test_model_and_drawing_are_found_in_any_package(fork, tmp_path, drawn, kind, reason, setup):
+    fork(("means3D = pc.get_xyz", f"means3D = {drawn}"), ("def training_setup(", f"def {setup}("))
     package = tmp_path / "splats/parts"
     package.mkdir(parents=True)
     (tmp_path / "scene/gaussian_model.py").rename(package / "model.py")

@@ -1,6 +1,7 @@
 """The real packages gaussian-splatting and gaussian-splatting-mcmc, on the CPU."""
 
 import json
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,8 +11,11 @@ import torch
 from fragprune_gaussian_splatting import GaussianSplatting
 from fragprune_plugins.adapting import HostRepo, SessionError, read_ply
 from fragprune_plugins.files import sidecar
+from fragprune_plugins.hosts.choosing import attempt
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.plugins.loading import load_plugins
+from fragprune_plugins.workbench.check.work import judge
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 PARAMETERS = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
@@ -35,6 +39,15 @@ def test_only_the_installed_package_fits(tmp_path):
     assert not Vanilla3DGS().match(repo).fits
     assert not adapter.match(HostRepo(tmp_path)).fits
     assert not adapter.match(HostRepo(repo.root / "gaussian_splatting")).fits
+
+
+def test_its_checkout_is_told_to_be_installed(tmp_path):
+    package = HostRepo.installed("gaussian_splatting").root / "gaussian_splatting"
+    shutil.copytree(package, tmp_path / "gaussian_splatting", ignore=lambda *_: ["__pycache__"])
+    plugins, repo = load_plugins(), HostRepo(tmp_path)
+    verdict = judge(repo, attempt(repo, plugins.adapters), plugins.adapters, plugins)
+    assert verdict.kind == "never"
+    assert f"pip install {tmp_path}; fragprune check gaussian_splatting" in verdict.sentence
 
 
 def test_another_backend_is_refused_by_name():

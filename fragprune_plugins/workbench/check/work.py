@@ -325,6 +325,11 @@ def judge(
             for folder, fits in inside
         )
         return Verdict("inside", sentence, own.reasons[0], name, differs, inside)
+    if nearest and nearest.held == nearest.looked_up and nearest.adapter.installed:
+        package = nearest.adapter.installed[0]
+        reason = f"its source is trained with once it is installed, as {package}"
+        sentence = f"Not here: {reason}. pip install {repo.root}; fragprune check {package}"
+        return Verdict("never", sentence, reason, name, differs)
     reason = f"{plain.folder}/: {plain.reasons[0]}" if plain.folder else plain.reasons[0]
     return Verdict("never", f"Not possible: {reason}.", reason, name, differs)
 
