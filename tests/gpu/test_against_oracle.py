@@ -157,6 +157,21 @@ def test_lists_that_do_not_fit_are_drawn_again_with_more_room(device: EmulatedDe
         assert torch.equal(expected[name], found[name]), name
 
 
+def test_room_that_another_thread_makes_meanwhile_is_not_this_frames(
+    device: EmulatedDevice, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inputs, small, read = scenes.random_scene(0), CudaEngine(device), frame.Drawing.read
+    expected = small.rasterize(inputs, None).image
+    small.capacity = 7
+
+    def meanwhile(drawing: frame.Drawing) -> int:
+        small.capacity = 1 << 13
+        return read(drawing)
+
+    monkeypatch.setattr(frame.Drawing, "read", meanwhile)
+    assert torch.equal(small.rasterize(inputs, None).image, expected)
+
+
 def test_more_entries_than_can_be_counted_are_refused(
     engine: CudaEngine, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -88,7 +88,8 @@ class CudaEngine:
         if deterministic is None:
             deterministic = torch.are_deterministic_algorithms_enabled()
         while True:
-            drawn = drawing.draw(self.capacity, wanted, deterministic=deterministic)
-            if (entries := drawing.read()) <= self.capacity:
+            room = self.capacity  # another thread may need more while this one waits
+            drawn = drawing.draw(room, wanted, deterministic=deterministic)
+            if (entries := drawing.read()) <= room:
                 return drawn
             self.capacity = entries + entries // 4
