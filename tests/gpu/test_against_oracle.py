@@ -22,6 +22,7 @@ from native.test_dialects import dialect, flat, test_offsets_beyond_all_bounds_a
 from native.test_invariants import assert_identical, everything
 
 from fragprune_plugins.engines.cpu.engine import CpuEngine
+from fragprune_plugins.engines.cuda import engine as cuda
 from fragprune_plugins.engines.cuda import frame
 from fragprune_plugins.engines.cuda.engine import CudaEngine
 from fragprune_plugins.errors import EngineError, InputError
@@ -170,6 +171,17 @@ def test_room_that_another_thread_makes_meanwhile_is_not_this_frames(
 
     monkeypatch.setattr(frame.Drawing, "read", meanwhile)
     assert torch.equal(small.rasterize(inputs, None).image, expected)
+
+
+def test_room_is_not_made_for_more_entries_than_can_be_counted(
+    device: EmulatedDevice, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inputs, small = scenes.random_scene(0), CudaEngine(device)
+    most = 1 + round(small.rasterize(inputs, None).entries_per_pixel * 40 * 28)
+    monkeypatch.setattr(cuda, "ENTRIES_MAX", most)
+    small.capacity = 7
+    small.rasterize(inputs, None)
+    assert small.capacity == most
 
 
 def test_more_entries_than_can_be_counted_are_refused(

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from fragprune_plugins.engines.calling import Wanted, with_gradients, with_joined_sh
 from fragprune_plugins.engines.cuda.driver import Driver
-from fragprune_plugins.engines.cuda.frame import Device, Drawing
+from fragprune_plugins.engines.cuda.frame import ENTRIES_MAX, Device, Drawing
 from fragprune_plugins.errors import EngineError, InputError
 from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats
 
@@ -88,8 +88,7 @@ class CudaEngine:
         if deterministic is None:
             deterministic = torch.are_deterministic_algorithms_enabled()
         while True:
-            room = self.capacity  # another thread may need more while this one waits
-            drawn = drawing.draw(room, wanted, deterministic=deterministic)
-            if (entries := drawing.read()) <= room:
+            drawn = drawing.draw(room := self.capacity, wanted, deterministic=deterministic)
+            if (entries := drawing.read()) <= room:  # another thread may have made more meanwhile
                 return drawn
-            self.capacity = entries + entries // 4
+            self.capacity = min(entries + entries // 4, ENTRIES_MAX)
