@@ -35,6 +35,7 @@ from fragprune_plugins.engines import create_engine
 from fragprune_plugins.engines.cuda import self_check
 from fragprune_plugins.engines.cuda.engine import CudaEngine
 from fragprune_plugins.engines.cuda.driver import Driver
+from fragprune_plugins.errors import EngineError
 import scenes
 
 asked = []
@@ -84,6 +85,16 @@ assert_identical(expected, everything(CudaEngine(Second(), deterministic=True), 
 assert current() == int(torchs) != int(cu.cuDevicePrimaryCtxRetain(1)[1])
 assert cu.cuCtxPopCurrent()[0] == 0
 assert int(cu.cuCtxPopCurrent()[0]) != 0  # and nothing else was left on the stack
+"""
+
+AN_EARLIER_KERNEL_FAILED = """
+os.environ["FAKE_FAILED"] = "1"
+try:
+    CudaEngine().rasterize(inputs, thresholds)
+except EngineError as error:
+    assert type(error) is EngineError and "ILLEGAL_ADDRESS" in error.found, error
+else:
+    raise AssertionError
 """
 
 
@@ -136,3 +147,10 @@ def test_the_driver_is_asked_for_what_the_emulation_does(script: Callable[[str],
     assert "fp_blend from machine code" in said
     assert "fp_chain from PTX" in said
     script(ANOTHER_GPU)
+
+
+def test_what_an_earlier_kernel_did_is_not_put_on_the_code_of_the_next(
+    script: Callable[[str], str],
+) -> None:
+    """A failed kernel fails every later call, so loading code would seem to be refused."""
+    script(AN_EARLIER_KERNEL_FAILED)

@@ -99,11 +99,8 @@ class Driver:
             function = self._function(index, source, macros, kernel)
             stream = torch.cuda.current_stream(index).cuda_stream
             parameters = (ctypes.c_void_p * 1)(ctypes.addressof(arguments))
-            self._call(
-                "cuLaunchKernel",
-                *(function, blocks, 1, 1, THREADS, 1, 1, 0, stream),
-                *(ctypes.addressof(parameters), 0),
-            )
+            sizes = blocks, 1, 1, THREADS, 1, 1, 0
+            self._call("cuLaunchKernel", function, *sizes, stream, ctypes.addressof(parameters), 0)
         finally:
             self._call("cuCtxPopCurrent")
 
@@ -123,21 +120,20 @@ class Driver:
             if module not in self._modules:
                 self._modules[module] = self._load(index, source, macros)
             if (kernel, module) not in self._functions:
-                self._functions[kernel, module] = self._call(
-                    "cuModuleGetFunction", self._modules[module], kernel.encode()
-                )
+                named = self._modules[module], kernel.encode()
+                self._functions[kernel, module] = self._call("cuModuleGetFunction", *named)
             return self._functions[kernel, module]
 
     def _load(self, index: int, source: str, macros: dict[str, int]) -> Any:
         """Load machine code for this GPU, or PTX if its driver refuses the machine code."""
+        self._call("cuCtxSynchronize")  # or a kernel that failed earlier would seem to be a refusal
         major, minor = torch.cuda.get_device_capability(index)
         capability = 10 * major + minor
         compiler = kernels.compiler()
         try:
             target = kernels.target_of(capability, compiler.architectures)
-            tries = [target, target.replace("sm_", "compute_")]
             failures = []
-            for way in dict.fromkeys(tries):
+            for way in dict.fromkeys((target, target.replace("sm_", "compute_"))):
                 image, _ = kernels.image_of(source, macros, way, compiler)
                 try:
                     return self._call("cuModuleLoadData", image.code)
