@@ -84,7 +84,9 @@ def test_a_folder_that_cannot_be_written_leaves_the_check_to_each_process(
     assert checks == []
 
 
-def test_it_holds_for_gpus_of_one_kind_and_a_driver(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_holds_for_gpus_of_one_kind_a_driver_and_this_text(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     gpu = {"name": "H100", "major": 9, "minor": 0, "multi_processor_count": 132, "uuid": "a"}
     compiler = SimpleNamespace(name="nvrtc", version="13.5")
     monkeypatch.setattr(kernels, "compiler", lambda: compiler)
@@ -101,6 +103,8 @@ def test_it_holds_for_gpus_of_one_kind_and_a_driver(monkeypatch: pytest.MonkeyPa
     assert circumstances(uuid="b") == here
     assert circumstances("13050; 580.95") != here
     assert circumstances(name="H200") != here
+    monkeypatch.setattr(self_check, "_OWN", b"mended")
+    assert circumstances() != here
     self_check._circumstances.cache_clear()
 
 
