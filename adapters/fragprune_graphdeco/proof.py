@@ -152,6 +152,7 @@ class _Both:
         theirs: what the host's rasterizer returned.
         ours: what the dialect answers.
         seen: what our engine draws, with all meanings.
+        slack: how many times more they may differ than by rounding alone.
     """
 
     what: str
@@ -159,6 +160,7 @@ class _Both:
     theirs: tuple[Any, ...]
     ours: tuple[Any, ...]
     seen: Seen
+    slack: int
 
 
 class _Trial:
@@ -189,8 +191,8 @@ class _Trial:
         with torch.enable_grad():
             chart = likeness.chart(own, self.dialect.unpack(self.drawn).view)
             both = [
-                self._draw("the host's own call", own, settings),
-                self._draw("a chart through its camera", chart, self._for_the_chart()),
+                self._draw("the host's own call", own, settings, likeness.OWN),
+                self._draw("a chart through its camera", chart, self._for_the_chart(), 1),
             ]
             found = [self._output(number, both) for number in range(len(both[0].theirs))]
         made = {number: name for number, (name, new) in enumerate(found) if new}
@@ -207,7 +209,7 @@ class _Trial:
             changed["antialiasing"] = False
         return settings._replace(**changed) if changed else settings
 
-    def _draw(self, what: str, arguments: dict[str, Tensor], settings: Any) -> _Both:
+    def _draw(self, what: str, arguments: dict[str, Tensor], settings: Any, slack: int) -> _Both:
         excused = _SHAPE if getattr(settings, "antialiasing", False) else ()
         leaves = {
             name: each.detach().requires_grad_()
@@ -228,7 +230,7 @@ class _Trial:
             ours, seen = _packed(
                 self.dialect, call, self.dialect.unpack(call), lambda each, _=0: draw(each)
             )
-        return _Both(what, leaves, theirs, ours, seen)
+        return _Both(what, leaves, theirs, ours, seen, slack)
 
     def _output(self, number: int, both: list[_Both]) -> tuple[str, bool]:
         """The meaning of an output, and whether it is another than the dialect answers."""
@@ -239,11 +241,12 @@ class _Trial:
         unread = number in self.place.unread or (number < len(own.ours) and said)
         is_picture = not likeness.difference(ours[1], chart.seen.drawn.image)
         name, new = likeness.meaning(ours[1], chart.seen) or "as the adapter answers", False
-        if told := _first(both, map(likeness.difference, theirs, ours)):
+        slacks = [each.slack for each in both]
+        if told := _first(both, map(likeness.difference, theirs, ours, slacks)):
             if is_picture:
                 raise _OtherwiseError(f"another picture: {told}")
             name, new = likeness.meaning(theirs[1], chart.seen), True
-            if not name or likeness.difference(theirs[0], _made(name, own.seen)):
+            if not name or likeness.difference(theirs[0], _made(name, own.seen), own.slack):
                 if unread:
                     return "something unknown that is not read", False
                 raise _OtherwiseError(
@@ -280,7 +283,7 @@ def _gradient_difference(names: Collection[str], both: _Both, theirs: Any, ours:
     """The first difference between the gradients of two outputs in some arguments, or ""."""
     leaves = {name: leaf for name, leaf in both.leaves.items() if name in names}
     found, expected = (_gradient(each, leaves) for each in (theirs, ours))
-    return next(likeness.gradient_differences(found, expected, leaves), "")
+    return next(likeness.gradient_differences(found, expected, leaves, both.slack), "")
 
 
 def _gradient(output: Any, leaves: dict[str, Tensor]) -> dict[str, Tensor | None]:

@@ -117,6 +117,19 @@ def test_black_points_lie_where_colours_are_cut_and_do_not_hinder_a_proof(host):
     assert proved.outputs == EQUAL["none"]
 
 
+def test_a_host_may_round_what_is_long_and_thin(host):
+    """Of its determinant a c - b b float32 leaves few digits. A model has some such Gaussians."""
+    with running(host("none")) as started:
+        model = started.model(300, setup=False)
+        with torch.no_grad():
+            model._scaling[:4] = torch.tensor([9.0, 1e-4, 1e-4]).log()
+            model._rotation[:4] = torch.tensor([0.92, 0.0, 0.0, 0.38])  # 45 degrees on the picture
+            model._opacity[:4] = -3.9
+        started.render(started.camera(96, 64), model)
+        (proved,) = started.session.proofs.values()
+    assert proved is not None
+
+
 @pytest.mark.parametrize("difference", OTHERWISE)
 def test_a_rasterizer_that_draws_otherwise_is_refused(host, difference):
     with pytest.raises(ProofError) as refused:
