@@ -76,6 +76,14 @@ def test_all_kernels_compile_without_stack_or_spills(
         check(job.result())
 
 
+def test_volta_is_drawn_on_where_the_toolkit_still_makes_code_for_it(
+    nvrtc: kernels.Nvrtc, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It has all that kernels need; NVRTC 12 knows it, and 13 does not."""
+    monkeypatch.setattr(nvrtc._nvrtc, "nvrtcGetSupportedArchs", lambda: (0, [60, 70, 75]))
+    assert kernels.target_of(70, kernels.Nvrtc().architectures) == "sm_70"
+
+
 @pytest.mark.parametrize("source", ["blend", "unblend"])
 def test_all_that_can_be_asked_for_at_once_compiles(nvrtc: kernels.Nvrtc, source: str) -> None:
     check(nvrtc.compile(source, {**MACROS, **EVERYTHING}, "sm_75"))

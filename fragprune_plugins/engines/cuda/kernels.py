@@ -27,7 +27,7 @@ CACHE: Final = "FRAGPRUNE_CACHE"
 
 SOURCES: Final = Path(native.__file__).parent / "cuda"
 
-OLDEST: Final = 75
+OLDEST: Final = 70
 """Compute capability, major times ten plus minor: warps' matching and independent lanes."""
 
 _OPTIONS: Final = ("--std=c++17", "--fmad=false")
@@ -158,10 +158,8 @@ def target_of(capability: int, architectures: tuple[int, ...]) -> str:
         return f"sm_{capability}"
     older = [code for code in architectures if code <= capability]
     if not older:
-        raise Unavailable(
-            f"compute capability {capability / 10} is older than "
-            f"{min(architectures, default=OLDEST) / 10}"
-        )
+        least = min(architectures, default=OLDEST) / 10
+        raise Unavailable(f"compute capability {capability / 10} is older than {least}")
     return f"compute_{max(older)}"
 
 
