@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -159,7 +159,7 @@ def on_rasterize(session: SessionState, call: SeamCall) -> Any:
     presses = stage is not None and stage.learning and session.settings.goal.on_area
     if not state.store.cuts and not presses:
         return by_host()
-    with directly():
+    with directly(means.device):
         inputs, engine = unpack(session, drawn)
         inputs = replace(inputs, **state.store.rules)
         if stage is None:
@@ -225,18 +225,20 @@ def proved_answer(
 
 def draw(session: SessionState, call: HostCall) -> Any:
     """Draw a call without thresholds, by our engine."""
-    with directly():
+    with directly(call[session.dialect.means].device):
         inputs, engine = unpack(session, call)
         return session.dialect.answer(call, inputs, lambda each, _=0: engine.rasterize(each, None))
 
 
-def directly() -> AbstractContextManager[None]:
-    """Inside, torch functions skip the detour by which ``--device cpu`` redirects a host's.
+@contextmanager
+def directly(device: torch.device) -> Iterator[None]:
+    """Inside, torch functions skip the detour of ``--device cpu``, and a host's autocast.
 
-    It is a Python function around each torch call, and takes as long as a small picture.
+    The first takes as long as a small picture, the second puts Gaussians pixels away.
     """
-    context: AbstractContextManager[None] = torch._C.DisableTorchFunction()
-    return context
+    kind = "cuda" if device.type == "cuda" else "cpu"  # older torch refuses other names
+    with torch._C.DisableTorchFunction(), torch.autocast(kind, enabled=False):
+        yield
 
 
 def unpack(session: SessionState, call: HostCall) -> tuple[RasterInputs, Engine]:

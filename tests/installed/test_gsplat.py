@@ -145,6 +145,16 @@ def test_our_picture_is_the_one_of_gsplats_own_formulas(session_on, packed, mode
         assert info["radii"].shape == ((len(rows),) if packed else (2, 40)) + axes()
 
 
+def test_a_loop_in_half_precision_gets_the_picture_of_gsplats_kernels(session_on):
+    """They project in float32 whatever a user's autocast says, and so do we."""
+    with session_on(Gsplat()):
+        params, _ = new_params(40)
+        expected, *_ = draw(params)
+        with torch.autocast("cpu", torch.bfloat16):
+            found, *_ = draw(params)
+        assert torch.equal(found, expected)
+
+
 def test_radii_are_those_of_gsplats_own_formulas(session_on):
     """To the pixel until 1.4. Since 1.5 gsplat's formulas in torch leave opacity out."""
     with session_on(Gsplat()):
