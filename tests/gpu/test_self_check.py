@@ -144,6 +144,8 @@ def test_crashes_and_hangs_stay_in_a_process_of_their_own(
         (RuntimeError("CUDA error: illegal address\nCompile with DSA"), 3, "illegal address"),
         (EngineError("driver", "CUDA_ERROR_LAUNCH_FAILED", "success", "Look."), 3, "LAUNCH"),
         (torch.cuda.OutOfMemoryError("out of memory"), 4, "out of memory"),
+        (RuntimeError("CUDA error: out of memory\nCompile with DSA"), 4, "out of memory"),
+        (EngineError("driver", "CUDA_ERROR_OUT_OF_MEMORY", "success", "Look."), 4, "OUT_OF"),
         (MemoryError(), 4, "MemoryError"),
         (KernelError("kernels", "sm_999", "code", "Update."), 4, "sm_999"),
     ],

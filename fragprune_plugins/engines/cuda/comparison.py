@@ -281,7 +281,9 @@ def main(device: str) -> int:
         print(BEGUN, flush=True)
         found = compare(gpu, where)
     except Exception as why:
-        short = isinstance(why, (KernelError, MemoryError, torch.cuda.OutOfMemoryError))
+        # Torch's allocator has an error of its own. Kernels need memory, too, when they first run.
+        short = "out of memory" in str(why).replace("_", " ").lower()
+        short |= isinstance(why, (KernelError, MemoryError, torch.cuda.OutOfMemoryError))
         print(f"{type(why).__name__}: {why}".splitlines()[0], file=sys.stderr)
         return FAILS if begun and not short else COULD_NOT_RUN
     print("; ".join(found), file=sys.stderr)
