@@ -13,7 +13,7 @@ from torch import Tensor
 
 from fragprune_graphdeco import stand_ins
 from fragprune_gsplat.harmonics import basis
-from fragprune_gsplat.projection import TILE, Projection, Rules, covariances, project
+from fragprune_gsplat.projection import TILE, Projection, Rules, covariances, product, project
 from fragprune_plugins.adapting import (
     Dialect,
     Footprints,
@@ -162,7 +162,7 @@ class GsplatDialect(Dialect):
         directions = torch.nn.functional.normalize(means - campos, dim=-1)
         harmonics = basis(directions, degree)
         used = colors[:, : harmonics.shape[1]]
-        return (torch.einsum("nk,nkc->nc", harmonics, used) + 0.5).clamp_min(0)
+        return (product(harmonics[:, None], used)[:, 0] + 0.5).clamp_min(0)
 
     @staticmethod
     def _refuse(call: HostCall) -> None:

@@ -71,6 +71,15 @@ class Projection:
         return (self.radii > 0).all(dim=-1)
 
 
+def product(a: Tensor, b: Tensor) -> Tensor:
+    """a @ b to the last bits of float32.
+
+    On a GPU, a host may let torch multiply matrices with 10 of the 23 (TF32). gsplat's kernels do
+    not, and it would put Gaussians beside their pixels.
+    """
+    return (a[..., :, :, None] * b[..., None, :, :]).sum(-2) if a.is_cuda else a @ b
+
+
 def covariances(quats: Tensor, scales: Tensor) -> Tensor:
     """(N, 3, 3) from quaternions (N, 4) w, x, y, z of any length and activated scales (N, 3)."""
     w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
@@ -80,7 +89,7 @@ def covariances(quats: Tensor, scales: Tensor) -> Tensor:
         torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], dim=-1),
     )
     root = torch.stack(rows, dim=-2) * scales[:, None]
-    return root @ root.transpose(-1, -2)
+    return product(root, root.transpose(-1, -2))
 
 
 def project(
@@ -103,7 +112,7 @@ def project(
         K: (3, 3) intrinsics.
     """
     rotation = viewmat[:3, :3]
-    seen = means @ rotation.T + viewmat[:3, 3]
+    seen = product(means[:, None], rotation.T)[:, 0] + viewmat[:3, 3]
     depths = seen[:, 2]
     inside = (depths >= rules.near) & (depths <= rules.far)
     seen = torch.where(inside[:, None], seen, seen.new_tensor([0.0, 0.0, 1.0]))
@@ -120,8 +129,8 @@ def project(
         ],
         dim=-2,
     )
-    flat = jacobian @ rotation
-    cov = flat @ covars @ flat.transpose(-1, -2)
+    flat = product(jacobian, rotation)
+    cov = product(product(flat, covars), flat.transpose(-1, -2))
     a, b, c = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
     before = a * c - b * b
     a, c = a + rules.eps2d, c + rules.eps2d

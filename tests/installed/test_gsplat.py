@@ -18,7 +18,7 @@ from installed.gsplat_host import axes, new_params, releases
 from installed.gsplat_host import draw as drawn_by_gsplat
 
 from fragprune_gsplat import Gsplat
-from fragprune_gsplat.projection import covariances
+from fragprune_gsplat.projection import Rules, covariances, project
 from fragprune_plugins.adapting import HostRepo, read_ply
 from fragprune_plugins.errors import InputError, SessionError, SidecarError, UsageError
 from fragprune_plugins.files import sidecar
@@ -153,6 +153,38 @@ def test_a_loop_in_half_precision_gets_the_picture_of_gsplats_kernels(session_on
         with torch.autocast("cpu", torch.bfloat16):
             found, *_ = draw(params)
         assert torch.equal(found, expected)
+
+
+class OnAGpu(torch.Tensor):
+    """Says that it is, and is in no matrix product."""
+
+    is_cuda = True
+
+    @classmethod
+    def __torch_function__(cls, func, types, args=(), kwargs=None):
+        assert func.__name__ not in {"__matmul__", "matmul", "mm", "bmm", "einsum"}
+        return super().__torch_function__(func, types, args, kwargs)
+
+
+def test_nothing_that_decides_a_place_is_left_to_tf32():
+    """Torch may round the factors of matrices on a GPU to 10 bits, if a user lets it."""
+    generator = torch.Generator().manual_seed(0)
+    made = [torch.randn(*shape, generator=generator) for shape in ((9, 3), (9, 4), (9, 3), (9,))]
+    viewmats, Ks = cameras()
+    rules = Rules(
+        eps2d=0.3, near=0.01, far=1e10, radius_clip=0, antialiased=True, floor=0.005, tight=True
+    )
+
+    def projected(means, quats, scales, opacities):
+        covars = covariances(quats, scales.exp())
+        given = viewmats[0].as_subclass(type(means)), Ks[0].as_subclass(type(means))
+        return project(means, covars, opacities.sigmoid(), *given, WIDTH, HEIGHT, rules)
+
+    expected = projected(*made)
+    found = projected(*(each.as_subclass(OnAGpu) for each in made))
+    for name, each in vars(expected).items():
+        plain = getattr(found, name).as_subclass(torch.Tensor)
+        torch.testing.assert_close(plain, each, rtol=1e-4, atol=1e-4)
 
 
 def test_radii_are_those_of_gsplats_own_formulas(session_on):
