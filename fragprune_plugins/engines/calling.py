@@ -193,6 +193,8 @@ def with_gradients(
     given = vars(inputs.splats) | {"hook": inputs.means2d_hook, "thresholds": thresholds}
     given["background"] = inputs.view.background
     tensors = {name: given[name] for name in _LEARNABLE if given.get(name) is not None}
+    if not torch.is_grad_enabled():  # the function would be told that parameters want theirs
+        tensors = {name: each.detach() for name, each in tensors.items()}
     drawn = _Rasterize.apply(draw, undraw, tuple(tensors), *tensors.values())  # type: ignore[no-untyped-call]
     return dict(zip((*_DIFFERENTIABLE, *_COUNTED), drawn, strict=True))
 

@@ -45,6 +45,17 @@ def test_gradients_of_the_image_alone_are_the_same(engine: CpuEngine) -> None:
         assert torch.equal(grad, grads[1][name]), name
 
 
+def test_a_picture_that_gets_no_gradients_takes_no_trouble_for_them(engine: CpuEngine) -> None:
+    """A trained model's parameters want some wherever they are drawn; rims need more lanes then."""
+    inputs, plain = scenes.random_scene(3, 60, *SIZE), scenes.random_thresholds(3, 60)
+    expected = engine.rasterize(inputs, plain).evaluated_per_pixel
+    made, _ = scenes.leaves(inputs)
+    wanting = plain.clone().requires_grad_()
+    assert engine.rasterize(made, wanting).evaluated_per_pixel > expected
+    with torch.no_grad():
+        assert engine.rasterize(made, wanting).evaluated_per_pixel == expected
+
+
 def test_an_engine_may_draw_more_than_was_asked_for() -> None:
     inputs = replace(scenes.random_scene(3, 12, 20, 10), planes=())
     assert ReferenceEngine().rasterize(inputs, None).alpha.shape == (1, 10, 20)
