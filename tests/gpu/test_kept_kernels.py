@@ -1,6 +1,7 @@
 """Compiled kernels are kept: by source, macros, architecture and toolkit; whole or not at all."""
 
 import errno
+import os
 import threading
 import time
 from pathlib import Path
@@ -45,6 +46,18 @@ def test_whatever_changes_the_code_is_compiled_anew(kept: Path, monkeypatch) -> 
     assert not kernels.image_of("blend", {}, "sm_90", Slow("1.1"))[1]
     monkeypatch.setattr(kernels, "digest_of_sources", lambda: b"edited")
     assert not kernels.image_of("blend", {}, "sm_90", slow)[1]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="other permissions")
+def test_what_one_user_builds_others_may_read(kept: Path) -> None:
+    """As kernels in a folder that a cluster's jobs share."""
+    before = os.umask(0o022)
+    try:
+        kernels.image_of("blend", {}, "sm_90", Slow())
+    finally:
+        os.umask(before)
+    (path,) = kept.glob("*.bin")
+    assert path.stat().st_mode & 0o777 == 0o644
 
 
 def test_damaged_files_are_compiled_anew(kept: Path) -> None:

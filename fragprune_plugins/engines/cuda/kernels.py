@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import tempfile
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import cache
@@ -239,6 +238,6 @@ def _write(path: Path, image: Image) -> None:
     """Write an image to the cache; readers see all of it or nothing."""
     log = image.log.encode()
     rest = log + image.code
-    with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-        file.write(f"{hashlib.sha256(rest).hexdigest()}\n{len(log)}\n".encode() + rest)
-    os.replace(file.name, path)
+    new = path.with_name(f"{path.name}.{os.urandom(8).hex()}")  # tempfile's are for one user alone
+    new.write_bytes(f"{hashlib.sha256(rest).hexdigest()}\n{len(log)}\n".encode() + rest)
+    os.replace(new, path)
