@@ -408,9 +408,9 @@ def _bound_at_first(tree: ast.Module) -> tuple[str, str] | None:
         bound = [(name, node) for node in nodes(function) for name in _binds(node)]
         first = {name: early[node] for name, node in bound if node in early}
         later = {name for name, node in bound if node not in early}
-        for name in every(function, ast.Name):
-            if name.id in first.keys() - later and name not in early:
-                return name.id, first[name.id]
+        for read in every(function, ast.Name):
+            if read.id in first.keys() - later and read not in early:
+                return read.id, first[read.id]
     return None
 
 

@@ -204,15 +204,12 @@ def _misfits(repo: HostRepo, module: str) -> tuple[str, ...]:
 def _own_folders(repo: HostRepo, module: str) -> Iterator[str]:
     """Folders of data and output that a script sets itself, whatever its command says."""
     body = getattr(repo.tree(module), "body", ())
-    main = [node.body for node in body if isinstance(node, ast.If) and "__name__" in _test(node)]
-    for node in (each for part in (body, *main) for each in part if isinstance(each, ast.Assign)):
+    asked = [node for node in body if isinstance(node, ast.If)]
+    main = [each for node in asked if "__name__" in ast.unparse(node.test) for each in node.body]
+    for node in (each for each in (*body, *main) if isinstance(each, ast.Assign)):
         name = getattr(node.targets[0], "attr", "")
         if name in ("source_path", "model_path") and f".{name}" not in ast.unparse(node.value):
             yield f"sets {name} itself, whatever its command says ({repo.at(module, node.lineno)})"
-
-
-def _test(node: ast.If) -> str:
-    return ast.unparse(node.test)
 
 
 _ANY = "any key"
