@@ -397,10 +397,11 @@ def _moved(repo: HostRepo, callers: HostRepo) -> Iterator[tuple[str, bool]]:
     for module, function in ((m, f) for m in _renderers(repo)[:1] for f in _drawing(repo, m)[:1]):
         paths = [path for path, text in texts if f"{function.name}(" in text]
         names = (reading.module_of(each.relative_to(callers.root).as_posix()) for each in paths)
-        words = (
-            w for each in names for c in callers.calls(each, function.name) for w in c.keywords
-        )
-        given = {w.arg or "" for w in words if not is_off(w.value)} & off_by_default(function)
+        calls = [call for each in names for call in callers.calls(each, function.name)]
+        takes = [each.arg for each in function.args.args]
+        words = [(word.arg or "", word.value) for call in calls for word in call.keywords]
+        words += [pair for call in calls for pair in zip(takes, call.args, strict=False)]
+        given = {name for name, value in words if not is_off(value)} & off_by_default(function)
         for why, kept in Drawing(repo, module, function, on=given).shapes() if given else ():
             if re.search(rf"from ([\w.]+, )*({'|'.join(sorted(given))}),", why):
                 yield why, kept

@@ -508,14 +508,16 @@ def test_a_model_in_a_folder_may_be_saved_by_a_script_above(fork, tmp_path):
     assert judged(HostRepo(tmp_path)).kind == "finetune"
 
 
-@pytest.mark.parametrize(("given", "kind"), [("None", "finetune"), ("dx", "never")])
+@pytest.mark.parametrize(
+    ("given", "kind"), [("dx=None", "finetune"), ("dx=dx", "never"), ("False, None, dx", "never")]
+)
 @pytest.mark.parametrize("inner", ["", "inner"])
 def test_an_argument_that_moves_gaussians_is_off_only_if_no_file_gives_it(
     fork, tmp_path, inner, given, kind
 ):
     moved = "    means3D = pc.get_xyz\n", MOVES
     fork(("override_color=None):", "override_color=None, dx=None):"), moved, root=tmp_path / inner)
-    (tmp_path / "slam.py").write_text(f"package = render(camera, model, pipe, bg, dx={given})\n")
+    (tmp_path / "slam.py").write_text(f"package = render(camera, model, pipe, bg, {given})\n")
     assert judged(HostRepo(tmp_path)).kind == kind
 
 
