@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -106,12 +107,10 @@ def attach_file(session: SessionState, model: Any, expected: Tensor, store: Thre
             session.unpacked = None
         return
     if not same:
-        raise AlignmentError(
-            f"{session.adapter.name}: unpacked model",
-            f"{len(means)} Gaussians that differ from the unpacked file's",
-            f"the file's {len(expected)} Gaussians in its order",
-            "Report this with the host's commit: it draws another model after unpacking.",
-        )
+        found = f"{len(means)} Gaussians that differ from the unpacked file's"
+        said = f"the file's {len(expected)} Gaussians in its order"
+        remedy = "Report this with the host's commit: it draws another model after unpacking."
+        raise AlignmentError(f"{session.adapter.name}: unpacked model", found, said, remedy)
     session.take_up(model, store.state_dict())
     session.unpacked = None
 
@@ -137,6 +136,7 @@ def on_restore(session: SessionState, call: SeamCall) -> Any:
     model, capture = call.model, call.how(call.first)
     held = optimizer_state(capture, f"{session.adapter.name}: checkpoint")
     saved = held.pop(CHECKPOINT_KEY, None)
+    capture = brought(capture, session.adapter.means(model).device)
     result = call.run(**{call.seam.needs[0]: capture})
     restore_rates(session, model)
     state = session.models.get(model)
@@ -147,6 +147,36 @@ def on_restore(session: SessionState, call: SeamCall) -> Any:
         state.store.load_state_dict(saved)
         session.expect_rows(model, state, str(call.seam))
     return result
+
+
+def brought(capture: Any, device: torch.device) -> Any:
+    """What a checkpoint holds, on its model's GPU, if none of it is there: ours are on the CPU.
+
+    Hosts load one to where it was saved. Scalars stay: Adam counts its steps on the CPU.
+    """
+    if device.type == "cpu" or any(each.device == device for each in tensors_of(capture)):
+        return capture
+    return changed(capture, lambda own: own.to(device) if own.ndim else own)
+
+
+def tensors_of(held: Any) -> Iterator[Tensor]:
+    """Whatever tensors a checkpoint holds."""
+    if isinstance(held, Tensor):
+        yield held
+    elif isinstance(held, dict | list | tuple):
+        for each in held.values() if isinstance(held, dict) else held:
+            yield from tensors_of(each)
+
+
+def changed(held: Any, change: Callable[[Tensor], Tensor]) -> Any:
+    """What a checkpoint holds, with its tensors changed; parameters stay parameters."""
+    if isinstance(held, dict):
+        return {name: changed(each, change) for name, each in held.items()}
+    if isinstance(held, list | tuple):
+        return type(held)(changed(each, change) for each in held)
+    if not isinstance(held, Tensor) or (new := change(held)) is held:
+        return held
+    return torch.nn.Parameter(new.detach()) if held.requires_grad else new
 
 
 def restore_rates(session: SessionState, model: Any) -> None:
@@ -167,10 +197,7 @@ def rows_of(means: Tensor, among: Tensor, where: str) -> Tensor:
     _, first, which = np.unique(both, axis=0, return_index=True, return_inverse=True)
     rows = first[which.reshape(-1)[len(known) :]]
     if lost := int((rows >= len(known)).sum()):
-        raise AlignmentError(
-            where,
-            f"{lost} of {len(wanted)} positions without a Gaussian",
-            f"positions of the {len(known)} Gaussians",
-            "Report this with the host's commit: it packs another model.",
-        )
+        found = f"{lost} of {len(wanted)} positions without a Gaussian"
+        remedy = "Report this with the host's commit: it packs another model."
+        raise AlignmentError(where, found, f"positions of the {len(known)} Gaussians", remedy)
     return torch.from_numpy(rows)

@@ -26,6 +26,7 @@ from fragprune_plugins.hosts.adapter import (
 )
 from fragprune_plugins.injection.command import HostCommand
 from fragprune_plugins.injection.process import knowing_numpy
+from fragprune_plugins.injection.saving import changed, tensors_of
 
 log = logging.getLogger("fragprune")
 
@@ -75,19 +76,13 @@ def find(adapter: ScriptAdapter, host: HostCommand, output: Path | None) -> Star
         saved.pop()
         newer += 1
     if not saved and newer:
-        raise UsageError(
-            "--stage finetune",
-            f"only results of stage 2 or of a control in {where}",
-            "a file that the host's own training wrote",
-            f"To continue from one of these files, name it with {flag}.",
-        )
+        found, expected = "only results of stage 2 or of a control", "a file of the host's training"
+        remedy = f"To continue from one of these files, name it with {flag}."
+        raise UsageError("--stage finetune", f"{found} in {where}", expected, remedy)
     if not saved:
-        raise UsageError(
-            "--stage finetune",
-            f"no model in {where}",
-            f"{flag} FILE, or {host.line.output[-1]} DIR of a finished training",
-            "Add one of these flags to the host's command.",
-        )
+        expected = f"{flag} FILE, or {host.line.output[-1]} DIR of a finished training"
+        remedy = "Add one of these flags to the host's command."
+        raise UsageError("--stage finetune", f"no model in {where}", expected, remedy)
     iteration, path = saved[-1]
     later = [(at, file) for at, file in saved if at > iteration and not _learned(file)]
     if later:
@@ -174,7 +169,7 @@ def holds(start: Path, ply: Path) -> bool:
     if start.suffix == ".ply":
         return True
     rows = len(PlyData.read(ply)["vertex"].data)
-    return any(each.shape[:1] == (rows,) for each in _tensors(_read_checkpoint(start)[0]))
+    return any(each.shape[:1] == (rows,) for each in tensors_of(_read_checkpoint(start)[0]))
 
 
 def part_of(start: Path, kept: Tensor, folder: Path) -> Path:
@@ -190,29 +185,9 @@ def part_of(start: Path, kept: Tensor, folder: Path) -> Path:
         ply.write(target)
     else:
         capture, iteration = _read_checkpoint(start)
-        torch.save((_rows(capture, kept), iteration), target)
+        part = changed(capture, lambda own: own[kept] if own.shape[:1] == kept.shape else own)
+        torch.save((part, iteration), target)
     return target
-
-
-def _tensors(held: Any) -> Iterator[Tensor]:
-    """Whatever tensors a checkpoint holds."""
-    if isinstance(held, Tensor):
-        yield held
-    elif isinstance(held, dict | list | tuple):
-        for each in held.values() if isinstance(held, dict) else held:
-            yield from _tensors(each)
-
-
-def _rows(held: Any, kept: Tensor) -> Any:
-    """What a checkpoint holds, of the Gaussians that are kept."""
-    if isinstance(held, dict):
-        return {name: _rows(each, kept) for name, each in held.items()}
-    if isinstance(held, list | tuple):
-        return type(held)(_rows(each, kept) for each in held)
-    if not isinstance(held, Tensor) or held.shape[:1] != kept.shape:
-        return held
-    rows = held.detach()[kept]
-    return torch.nn.Parameter(rows, held.requires_grad) if held.requires_grad else rows
 
 
 def _learned(path: Path) -> bool:
@@ -227,12 +202,9 @@ def _iteration_of_ply(ply: Path) -> int:
     number = ply.parent.name.removeprefix("iteration_")
     if ply.is_file() and number.isdigit():
         return int(number)
-    raise UsageError(
-        str(ply),
-        "a PLY outside iteration_N" if ply.is_file() else "no such file",
-        "a checkpoint, or point_cloud/iteration_N/point_cloud.ply",
-        "Check the path.",
-    )
+    found = "a PLY outside iteration_N" if ply.is_file() else "no such file"
+    expected = "a checkpoint, or point_cloud/iteration_N/point_cloud.ply"
+    raise UsageError(str(ply), found, expected, "Check the path.")
 
 
 def _read_checkpoint(path: Path) -> tuple[Any, int]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from miniatures import runs
-from miniatures.vanilla_3dgs import HOST
+from miniatures.vanilla_3dgs import HOST, running
 
 from fragprune_plugins import Control, Settings
 from fragprune_plugins.errors import HostFailed, ModelFileError, SidecarError, UsageError
@@ -225,3 +225,21 @@ def test_stage_two_does_not_take_an_earlier_runs_checkpoint_for_its_own_stage_on
     script.write_text("raise SystemExit(0)\n" + script.read_text())
     with pytest.raises(HostFailed, match="without a checkpoint of iteration 10"):
         run([str(script), *words[1:]], OPTIONS)
+
+
+def test_a_checkpoint_that_we_made_comes_to_the_gpu_of_its_model():
+    """Hosts load one to where it was saved; there "meta" stands for a GPU."""
+    with running() as host:
+        model, arguments = host.model(), host.arguments
+        host.step(model, host.camera(), 1)
+        made = model.capture()
+        for name, each in vars(model).items():
+            if isinstance(each, torch.nn.Parameter):
+                setattr(model, name, torch.nn.Parameter(each.to("meta")))
+        model.restore(made, arguments)
+        parameters = [group["params"][0] for group in model.optimizer.param_groups]
+        assert {each.device.type for each in parameters} == {"meta"}
+        assert all(each.is_leaf and each.requires_grad for each in parameters)
+        assert {each.device.type for each in (model.denom, model.max_radii2D)} == {"meta"}
+        moments = model.optimizer.state[model._xyz]
+        assert [moments[k].device.type for k in ("exp_avg", "step")] == ["meta", "cpu"]
