@@ -121,6 +121,7 @@ class Session(SessionState):
             while state.hooks:
                 state.hooks.pop().remove()
             state.hooked.clear()
+            state.views.clear()  # their calls hold the host's model, cameras and photographs
         findings = self._ledger.undo() if self._ledger else []
         self._ledger = None
         self.stand_ins.take_back()
@@ -170,12 +171,9 @@ class Session(SessionState):
         """
         stage = self.last_state.stage if self.last_state else None
         if stage and stage.steps and self.settings.goal.presses and not stage.viewed:
-            raise SessionError(
-                self.adapter.name,
-                f"{stage.steps} steps, and no view of the trained model drawn with its thresholds",
-                "one view or more in every step",
-                "Report this with the host's commit: the adapter misses how it draws.",
-            )
+            found = f"{stage.steps} steps, and no view of the trained model drawn with thresholds"
+            remedy = "Report this with the host's commit: the adapter misses how it draws."
+            raise SessionError(self.adapter.name, found, "one view or more in every step", remedy)
 
     def save_learned(self, iteration: int = 0) -> Path | None:
         """Save the model with the host's own function, and the sidecar beside it.

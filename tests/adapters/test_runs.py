@@ -21,7 +21,7 @@ from miniatures.hosts import HOSTS
 from miniatures.runs import OPTIONS, check_stage_two
 from miniatures.vanilla_3dgs import HOST, InterruptAt, run_script, running
 
-from fragprune_plugins import Control, Portable, Pressure, Schedule, Settings
+from fragprune_plugins import Control, Fewer, Portable, Pressure, Schedule, Settings
 from fragprune_plugins.adapting import HostRepo, Interrupted, SessionError, UsageError, read_ply
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection.launch import RunOptions, run
@@ -307,6 +307,18 @@ def test_a_run_that_could_not_learn_is_refused_before_it_begins(
     with pytest.raises(UsageError, match=words):
         run(command(photographs, tmp_path / "out", iterations, *more), options)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_target_keeps_nothing_of_the_host_for_the_measurement(photographs, tmp_path):
+    """Calls that draw views again hold the model, and photographs that are on a GPU."""
+    settings = replace(OPTIONS.settings, goal=Fewer(1.5))
+    gc.disable()
+    try:
+        run(command(photographs, tmp_path / "out", 10), replace(OPTIONS, settings=settings))
+        kinds = {type(each).__name__ for each in gc.get_objects()}
+        assert kinds.isdisjoint({"GaussianModel", "Camera", "Scene"})
+    finally:
+        gc.enable()
 
 
 def test_a_model_that_the_host_drops_is_not_kept_alive():

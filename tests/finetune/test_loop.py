@@ -1,5 +1,6 @@
 """Stage 2 without a host: what moves, what stays, where it lands."""
 
+import gc
 import random
 from dataclasses import replace
 
@@ -36,6 +37,17 @@ def test_what_is_not_named_stays_to_the_bit(model, dataset, train, moving):
         moved = not torch.equal(getattr(result.model, name), before[name])
         assert moved == (name in moving), name
         assert not getattr(result.model, name).requires_grad
+
+
+def test_nothing_waits_for_a_collection_after_it(model, dataset):
+    """A search trains several times, and moments are twice as large as the model."""
+    gc.disable()
+    try:
+        result = finetune(model, dataset, Settings(iterations=2, goal=Pressure(1e-3)))
+        kinds = [type(each).__name__ for each in gc.get_objects()]
+        assert (result.progress.steps, kinds.count("Training"), kinds.count("Adam")) == (2, 0, 1)
+    finally:
+        gc.enable()
 
 
 @pytest.mark.skipif(torch.__version__ < "2.4", reason="torch fuses no Adam on a CPU")

@@ -1,5 +1,7 @@
 """A model that knows its photographs by heart, and what it then learns with."""
 
+import gc
+import weakref
 from dataclasses import dataclass
 
 import pytest
@@ -149,3 +151,21 @@ def test_nothing_is_tried_where_somebody_chose_or_nothing_is_to_be_chosen(
     report = command(None, *options)
     assert report["settings"]["dropout"] == dropout
     assert report["forgotten"] is None
+
+
+def test_of_a_trial_nothing_is_left_in_a_gpus_memory(model, photographs, engine, monkeypatch):
+    """What waits for Python's collection is not free when the training itself begins."""
+    made = []
+
+    class Noted(trial.Training):
+        def __init__(self, *given):
+            super().__init__(*given)
+            made.append(weakref.ref(self))
+
+    monkeypatch.setattr(trial, "Training", Noted)
+    gc.disable()
+    try:
+        forgotten(model, photographs, engine=engine)
+        assert [each() for each in made] == [None]
+    finally:
+        gc.enable()

@@ -111,7 +111,7 @@ def _learned(training: Training, keeper: Keeper, progress: bool) -> FinetuneResu
     training.stage.check()
     count = training.processes.total(len(training.start))
     progress_made = replace(training.stage.progress(), steps=training.done, gaussians=count)
-    return FinetuneResult(
+    result = FinetuneResult(
         model=training.result_model(),
         settings=training.settings,
         curves=training.curves,
@@ -122,3 +122,5 @@ def _learned(training: Training, keeper: Keeper, progress: bool) -> FinetuneResu
         terminated=terminated,
         resumed_at=resumed,
     )
+    training.end()
+    return result

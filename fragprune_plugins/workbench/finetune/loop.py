@@ -153,6 +153,10 @@ class Training:
         model = replace(self.model, **learned, thresholds=self.stage.store)
         return model if model.pruned else model.untruncated()
 
+    def end(self) -> None:
+        """Free what steps alone need: moments, and stage 2, whose views hold this in a cycle."""
+        del self.optimizer, self.stage
+
     @property
     def seconds(self) -> float:
         """Wall-clock seconds of all steps, also of those before a checkpoint."""

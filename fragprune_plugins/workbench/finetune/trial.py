@@ -118,8 +118,9 @@ def forgotten(
     alone.first = False  # no observer is told of its steps
     training = Training(model, half, settings, Schedule(settings), engine, alone)
     training.learn(Keeper(None, training), progress=False)
+    other = training.result_model()
+    training.end()
     before, after = (
-        statistics.fmean(psnrs(Candidate(each), others, engine)[0])
-        for each in (model, training.result_model())
+        statistics.fmean(psnrs(Candidate(each), others, engine)[0]) for each in (model, other)
     )
     return before - after
