@@ -51,17 +51,17 @@ def proved(
     drawn = replace(drawn, still=not joint)
     shape = (str(call.seam), place, joint, *prover.shape(drawn))
     if shape not in session.proofs:
-        session.proofs[shape] = None
+        proof = None
         try:
-            session.proofs[shape] = _read_or_prove(session, prover, call, drawn, shape)
+            proof = _read_or_prove(session, prover, call, drawn, shape)
         except ProofError as error:
             if strict and not (prover.otherwise or session.trust):
-                del session.proofs[shape]
                 raise
             known = f"{error.found}; as known: {prover.otherwise}"
             log.warning("%s", f"not proved: {known}" if prover.otherwise else error)
         except (EngineError, InputError) as error:  # raised again where ours has to draw
             log.info("not proved: %s", error)
+        session.proofs[shape] = proof  # only now: a host may live on after another exception
     return session.proofs[shape]
 
 

@@ -321,6 +321,23 @@ def test_a_failed_proof_is_kept_and_not_repeated(host, monkeypatch):
     assert draw(folder, learn=True, trust=True) == [None]
 
 
+def test_a_proof_that_found_no_memory_counts_as_none(host, monkeypatch):
+    """A host may live on: 3DGS does when it draws for its viewer. The next call proves again."""
+    prove = RasterizerProver.prove
+
+    def without_memory(*_):
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
+
+    with running(host("dilation"), learn=True) as session:
+        model, camera = session.model(40), session.camera(96, 64)
+        monkeypatch.setattr(RasterizerProver, "prove", without_memory)
+        with pytest.raises(torch.cuda.OutOfMemoryError):
+            session.render(camera, model)
+        monkeypatch.setattr(RasterizerProver, "prove", prove)
+        with pytest.raises(ProofError):
+            session.render(camera, model)
+
+
 def test_a_stand_in_proves_nothing_and_says_so_once(caplog):
     caplog.set_level(logging.INFO, logger="fragprune")
     with vanilla_3dgs.running(learn=False, prove=True) as host:
