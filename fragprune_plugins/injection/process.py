@@ -47,7 +47,9 @@ def telling(script: Path, root: Path) -> Iterator[None]:
         message = "".join(str(error).strip().splitlines()[:1])
         expected, remedy = f"{script.name} to run to its end", "Read the traceback above."
         lacking = (error.name or "").split(".")[0] if isinstance(error, ImportError) else ""
-        if Path(frames[-1].filename).is_relative_to(_OURS):
+        if isinstance(error, torch.cuda.OutOfMemoryError):
+            remedy = "Free memory of the GPU, or need less (3DGS: -r 2, or --data_device cpu)."
+        elif Path(frames[-1].filename).is_relative_to(_OURS):
             remedy = "fragprune raised it. Report it with the traceback above."
         elif isinstance(error, ModuleNotFoundError) and not HostRepo(root).path(lacking):
             expected = "what the host itself imports"

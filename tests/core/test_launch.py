@@ -223,6 +223,16 @@ def test_a_package_that_our_own_code_misses_is_not_said_to_be_the_hosts(host, mo
         run([host("import torch\ntorch.median(0)")], CPU)
 
 
+def test_a_gpu_that_is_full_is_not_said_to_be_our_mistake(host, monkeypatch):
+    def full(*_):
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
+
+    monkeypatch.setattr(process, "_OURS", Path(__file__).parent)
+    monkeypatch.setattr(torch, "median", full)
+    with pytest.raises(HostFailed, match=r"2\.00 GiB.*Free memory of the GPU, or need less"):
+        run([host("import torch\ntorch.median(0)")], CPU)
+
+
 def test_what_a_host_imports_and_reads_is_looked_at_before_it_runs(host, tmp_path):
     """All at once, not one traceback after the other."""
     host("import icecream_of_tests", name="neighbour.py")
