@@ -208,10 +208,20 @@ def test_a_model_that_knows_its_photographs_by_heart_is_told_and_learns_otherwis
     assert (asked["gaussians"], asked["keep"], asked["forgotten"]) == (whole, None, None)
 
 
+FULL = torch.cuda.OutOfMemoryError(
+    "CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has 8 GiB."
+)
+
+
+@pytest.mark.parametrize(
+    "error", [ModelFileError("out", "a stand-in", "another", "Nothing."), FULL]
+)
 @pytest.mark.parametrize("where", [(trial, "forgotten"), (work, "kept")])
-def test_where_a_look_fails_stage_two_learns_as_asked(scene, tmp_path, monkeypatch, caplog, where):
+def test_where_a_look_fails_stage_two_learns_as_asked(
+    scene, tmp_path, monkeypatch, caplog, where, error
+):
     def fail(*_, **__):
-        raise ModelFileError("out", "a stand-in", "something else", "Nothing.")
+        raise error
 
     monkeypatch.setattr(trial, "forgotten", lambda *_, **__: trial.BY_HEART)
     monkeypatch.setattr(*where, fail)
@@ -222,6 +232,17 @@ def test_where_a_look_fails_stage_two_learns_as_asked(scene, tmp_path, monkeypat
     (record,) = records.find(tmp_path / "out")
     assert (record.data["keep"], record.data["forgotten"]) == (None, None)
     assert record.data["settings"]["dropout"] is None
+
+
+def test_where_a_gpu_has_no_room_to_measure_the_rest_is_reported(scene, tmp_path, monkeypatch):
+    def fail(*_, **__):
+        raise FULL
+
+    monkeypatch.setattr(work, "measure_all", fail)
+    report = ran(*WORDS, *command(scene, tmp_path / "out"))
+    assert (report["iterations"], report["after"]) == (6, None)
+    assert "Tried to allocate 2.00 GiB" in report["not_compared"]["found"]
+    assert records.find(tmp_path / "out")
 
 
 @pytest.mark.parametrize(("size", "read"), [("16", (16, 12)), ("-1", (40, 30))])

@@ -6,18 +6,20 @@ Between the stages it looks whether the model knows its photographs by heart.
 from __future__ import annotations
 
 import contextlib
+import gc
 import logging
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import click
+import torch
 from torch import Tensor
 
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.errors import FragpruneError
+from fragprune_plugins.errors import FragpruneError, NotComparedError
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.injection import launch
 from fragprune_plugins.injection.process import current_gpu
@@ -83,7 +85,7 @@ def run(
         not_compared: FragpruneError | None = summary.not_compared
         if photographs:
             try:
-                with current_gpu(engine.device):
+                with current_gpu(engine.device), _enough_memory():
                     *first, after = measure_models(photographs, engine)
                     before = first[0] if first else None
             except FragpruneError as error:  # the trained model is saved already
@@ -94,6 +96,20 @@ def run(
         more = {"curves": summary.curves, "photographs": read}
         records.leave(summary.model_after, "run", data | more)
     return Report(data, _describe(summary, data, not_compared))
+
+
+@contextlib.contextmanager
+def _enough_memory() -> Iterator[None]:
+    """Inside, a GPU that is full ends no more than what is done here: the training matters more."""
+    try:
+        yield
+    except torch.cuda.OutOfMemoryError as error:
+        raise NotComparedError(
+            "the GPU's memory",
+            str(error).partition(". GPU")[0],
+            "room for the models that the host trained",
+            "Compare them with fragprune compare, on a CPU if need be.",
+        ) from error
 
 
 def _figures(
@@ -231,10 +247,12 @@ class Looking:
     ) -> tuple[Settings, Tensor | None]:
         """Make the trial of ``fragprune finetune``, and score the Gaussians as it does."""
         try:
-            return self._look(ply, photographs, drawing, settings)
+            with _enough_memory():
+                return self._look(ply, photographs, drawing, settings)
         except FragpruneError as error:  # the host may read and draw more than we do
             log.warning("not tried whether it knows its photographs by heart, because of %s", error)
-            return settings, None
+        gc.collect()  # a trial that was cut short: the host needs the GPU's memory now
+        return settings, None
 
     def _look(
         self, ply: Path, photographs: Photographs, drawing: Mapping[str, Any], settings: Settings
