@@ -57,12 +57,9 @@ def on_append(session: SessionState, call: SeamCall) -> Any:
 def expect_children(call: SeamCall, found: str, right: bool) -> None:
     """Raise AlignmentError unless new rows are ``right``, one child per parent and repeat."""
     if not right:
-        raise AlignmentError(
-            str(call.seam),
-            found,
-            "one child per selected parent and repeat, in the host's order",
-            "Report this with the host's commit: its densification differs.",
-        )
+        expected = "one child per selected parent and repeat, in the host's order"
+        remedy = "Report this with the host's commit: its densification differs."
+        raise AlignmentError(str(call.seam), found, expected, remedy)
 
 
 def on_keep(session: SessionState, call: SeamCall) -> Any:

@@ -17,7 +17,7 @@ from fragprune_plugins.constants import NEUTRAL_LOGIT
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import AlignmentError, SessionError, UsageError
 from fragprune_plugins.hosts.dialect import HostCall
-from fragprune_plugins.hosts.seams import SeamCall
+from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
 from fragprune_plugins.injection.proofs import proved
 from fragprune_plugins.injection.saving import attach_file
 from fragprune_plugins.injection.state import ModelState, SessionState
@@ -32,6 +32,9 @@ from fragprune_plugins.plugins.hooks import thresholds_for
 from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 log = logging.getLogger("fragprune")
+
+
+SCALER = Seam(Role.LOSS, "torch.amp.grad_scaler", "GradScaler.scale", ("outputs",), external=True)
 
 
 class _AddToLoss(torch.autograd.Function):
@@ -87,13 +90,10 @@ def expect_to_train(session: SessionState, call: SeamCall, model: Any) -> None:
         UsageError: the model is already frozen in it.
     """
     if session.standing_still(model):
-        raise UsageError(
-            f"{session.adapter.name}: {call.seam}",
-            "an earlier phase of the training than the one in which stage 2 learns",
-            "a trained model, because stage 2 freezes it",
-            "Name a trained model to start from, or an iteration above 0 after which stage 2 "
-            "begins: --from-iter, or activate(from_iter=...).",
-        )
+        where, found = f"{session.adapter.name}: {call.seam}", "an earlier phase than stage 2's"
+        remedy = "Name a trained model to start from, or an iteration above 0 after which stage 2 "
+        remedy += "begins: --from-iter, or activate(from_iter=...)."
+        raise UsageError(where, found, "a trained model, because stage 2 freezes it", remedy)
 
 
 def expect_unpacked_attached(session: SessionState, call: SeamCall) -> None:
@@ -106,13 +106,10 @@ def expect_unpacked_attached(session: SessionState, call: SeamCall) -> None:
     if session.unpacked is None or session.pausing.get() or not isinstance(means, Tensor):
         return
     if torch.equal(means.detach().cpu(), session.unpacked[0]):
-        raise SessionError(
-            str(call.seam),
-            "Gaussians of a file with thresholds, in a model that no seam attached",
-            "a model with its thresholds",
-            "Attach it first, or load them: session.load(model, path). To draw without, use "
-            "fragprune_plugins.paused().",
-        )
+        found = "Gaussians of a file with thresholds, in a model that no seam attached"
+        remedy = "Attach it first, or load them: session.load(model, path). To draw without, use "
+        remedy += "fragprune_plugins.paused()."
+        raise SessionError(str(call.seam), found, "a model with its thresholds", remedy)
 
 
 def draw_view(
@@ -149,12 +146,9 @@ def on_rasterize(session: SessionState, call: SeamCall) -> Any:
         session.expect_rows(rendering[0], state, f"{session.adapter.name}: rasterizer call")
     expected = len(state.store if rows is None else rows)
     if len(means) != expected:
-        raise AlignmentError(
-            f"{session.adapter.name}: rasterizer call",
-            f"{len(means)} Gaussians",
-            f"{expected} of {len(state.store)}, one per drawn threshold",
-            "Report this with the host's commit.",
-        )
+        where, found = f"{session.adapter.name}: rasterizer call", f"{len(means)} Gaussians"
+        said = f"{expected} of {len(state.store)}, one per drawn threshold"
+        raise AlignmentError(where, found, said, "Report this with the host's commit.")
     stage = state.stage
     presses = stage is not None and stage.learning and session.settings.goal.on_area
     if not state.store.cuts and not presses:
@@ -283,6 +277,21 @@ def on_loss(session: SessionState, call: SeamCall) -> Any:
         for each in session.models.values():
             each.begun = False
     return call.run()
+
+
+def refuse_scaled(
+    session: SessionState, scale: Callable[..., Any], scaler: Any, args: Any, kwargs: Any
+) -> Any:
+    """Refuse a scaled loss: the pressure would be divided with it, and is not multiplied before.
+
+    Raises:
+        UsageError: the host's gradient scaler is on while thresholds learn.
+    """
+    if session.learn and scaler.is_enabled():
+        found = "a scaled loss, beside which the pressure vanishes"
+        remedy = "Train in float32, or with GradScaler(enabled=False)."
+        raise UsageError("GradScaler", found, "a loss as it is", remedy)
+    return scale(*args, **kwargs)
 
 
 class Unmeasured(torch.nn.Module):

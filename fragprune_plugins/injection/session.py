@@ -97,6 +97,7 @@ class Session(SessionState):
             extra = similarity.seam_of(self.repo)
             if extra is not None and extra.module not in sys.modules:  # late, it is the host's
                 self._ledger.wrap(extra, partial(enter, extra))
+            self._ledger.wrap(rasterizing.SCALER, partial(rasterizing.refuse_scaled, self))
             self.stand_ins.refuse_leftovers(self.repo.root)
         except BaseException:
             self._take_back()

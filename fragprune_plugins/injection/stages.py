@@ -78,12 +78,9 @@ class Stages:
         if from_iter is None:
             from_iter = self.adapter.densified(self.repo, host.script, host.arguments)
         if from_iter is None:
-            raise UsageError(
-                "--stage joint",
-                f"{self.adapter.info.title}, which does not tell when its densification is over",
-                "the iteration after which thresholds learn",
-                "Add --from-iter.",
-            )
+            found = f"{self.adapter.info.title}, which does not tell when its densification is over"
+            expected = "the iteration after which thresholds learn"
+            raise UsageError("--stage joint", found, expected, "Add --from-iter.")
         self._learn_within(from_iter, joint=True)
 
     def train_then_finetune(self) -> None:
@@ -152,12 +149,10 @@ class Stages:
             self._learn_within(self.options.from_iter)
             return
         if self.host.line.one_run:
-            raise UsageError(
-                "--stage finetune",
-                f"{self.host.script.name}, which cannot resume a training",
-                "--from-iter, the iteration of one run after which stage 2 begins",
-                "Add it, or give the trained PLY to fragprune finetune.",
-            )
+            found = f"{self.host.script.name}, which cannot resume a training"
+            expected = "--from-iter, the iteration of one run after which stage 2 begins"
+            remedy = "Add it, or give the trained PLY to fragprune finetune."
+            raise UsageError("--stage finetune", found, expected, remedy)
         self.host = self.host.of(*self.adapter.resumed_by(self.host.script, self.host.arguments))
         self.output = self.output or self.host.output
         start = self.start = self.start or starting.find(self.adapter, self.host, self.output)

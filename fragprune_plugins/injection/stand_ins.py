@@ -64,12 +64,9 @@ class StandIns:
             if not wanted:
                 continue
             if name in sys.modules:
-                raise LateImportError(
-                    name,
-                    "already imported",
-                    "activation before the host imports its rasterizer",
-                    "Start the host with fragprune run, or call activate() above those imports.",
-                )
+                expected = "activation before the host imports its rasterizer"
+                remedy = "Start the host with fragprune run, or call activate() above its imports."
+                raise LateImportError(name, "already imported", expected, remedy)
             sys.modules[name] = self._placed[name] = module
         for name, members in self._dialect.unneeded.items() if self._drop_in else ():
             if name not in sys.modules and find_spec(name) is None:

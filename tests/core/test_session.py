@@ -8,7 +8,7 @@ import torch
 from miniatures.vanilla_3dgs import joint, running
 
 from fragprune_plugins import Control, Portable, Pressure, Settings
-from fragprune_plugins.errors import RanksError, SessionError
+from fragprune_plugins.errors import RanksError, SessionError, UsageError
 from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
 from fragprune_plugins.injection import ranks
 from fragprune_plugins.injection.rasterizing import on_metric
@@ -141,3 +141,16 @@ def test_a_metric_without_its_weights_is_nan_be_it_a_function_or_a_class(error, 
             assert number.isnan()
     assert len(caplog.messages) == 2
     assert all("it is NaN" in said and "\n" not in said for said in caplog.messages)
+
+
+@pytest.mark.skipif(torch.__version__ < "2.3", reason="torch scales no gradient on a CPU")
+@pytest.mark.parametrize(("learn", "enabled"), [(True, True), (True, False), (False, True)])
+def test_a_scaled_loss_is_refused_where_the_pressure_would_vanish_beside_it(learn, enabled):
+    scaler, loss = torch.amp.GradScaler("cpu", enabled=enabled), torch.tensor(1.0)
+    with running(learn=learn):
+        if learn and enabled:
+            with pytest.raises(UsageError, match="the pressure vanishes"):
+                scaler.scale(loss)
+        else:
+            assert scaler.scale(loss) >= loss
+    assert scaler.scale(loss) >= loss
