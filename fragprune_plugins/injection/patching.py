@@ -149,12 +149,9 @@ class PatchLedger:
             and (not seam.external or self._is_hosts(other))
         ]
         if holders:
-            raise LateImportError(
-                str(seam),
-                f"already imported, and bound by name in {', '.join(sorted(holders))}",
-                "activation before the host's imports",
-                "Start the host with fragprune run, or call activate() above those imports.",
-            )
+            found = f"already imported, and bound by name in {', '.join(sorted(holders))}"
+            remedy = "Start the host with fragprune run, or call activate() above those imports."
+            raise LateImportError(str(seam), found, "activation before the host's imports", remedy)
 
 
 def _rebind(name: str, ours: Any, module: ModuleType) -> None:

@@ -28,13 +28,9 @@ def expect_one() -> None:
         ranks = torch.distributed.get_world_size()
         found = f"torch.distributed with {ranks} processes"
     if ranks > 1:
-        raise RanksError(
-            "learning",
-            found,
-            "one process that trains the model",
-            "Train in several processes without fragprune. Then learn: fragprune run --stage "
-            "finetune without torchrun; or torchrun -m fragprune_plugins finetune, in several.",
-        )
+        remedy = "Train in several processes without fragprune. Then learn: fragprune run --stage "
+        remedy += "finetune without torchrun, or torchrun -m fragprune_plugins finetune in several."
+        raise RanksError("learning", found, "one process that trains the model", remedy)
 
 
 def expect_no_launcher(command: list[str]) -> None:

@@ -75,10 +75,14 @@ def on_view(session: SessionState, call: SeamCall) -> Any:
     again = partial(draw_view, session, call.function, model, view, call.args, call.kwargs)
     measured = isinstance(session.settings.goal, Fewer)  # a kept view keeps its model alive
     if state is not None and state.stage is not None:
-        if state.stage.plan is not None and torch.is_grad_enabled():
-            state.seen[view] = None
-            if measured:
-                state.views[view] = again
+        learned = torch.is_grad_enabled()
+        state.beside = learned and bool(state.ordered) and state.stepped == state.steps
+        if learned and not state.beside:
+            state.drawn = state.steps
+            if state.stage.plan is not None:
+                state.seen[view] = None
+                if measured:
+                    state.views[view] = again
         state.stage.picture = str(getattr(call.first, "image_name", ""))
     return again()
 
@@ -251,7 +255,7 @@ def rasterize(
     part: int = 0,
 ) -> RasterOutputs:
     """Draw with thresholds (N,) or without; while learning, add the pressure to the loss."""
-    if state.stage is None:
+    if state.stage is None or state.beside:
         return engine.rasterize(inputs, thresholds)
     shown = state.stage.dropped(inputs)
     outputs = engine.rasterize(shown, thresholds)
@@ -275,6 +279,9 @@ def on_loss(session: SessionState, call: SeamCall) -> Any:
         if state.stage is not None and (state.begun or len(session.models) == 1):
             state.stage.on_loss(call.instance)
         for each in session.models.values():
+            if each.begun or each.stepped == each.steps:
+                in_order = each.begun and each.drawn == each.steps
+                each.ordered = each.ordered is not False and in_order
             each.begun = False
     return call.run()
 

@@ -54,6 +54,9 @@ class ModelState:
         stepped: value of ``steps`` at the last step of the store.
         pictured: what was drawn to learn from in this step: (``steps``, view, part).
         lent: per running optimizer step, (param group, the host's rate) to restore.
+        drawn: value of ``steps`` when a view was last drawn to learn from.
+        ordered: steps begin, draw, and go backward before optimizers step; None until one did.
+        beside: this view was drawn between two such steps, as for a viewer: nobody learns from it.
     """
 
     store: ThresholdStore
@@ -70,6 +73,9 @@ class ModelState:
     stepped: int = -1
     pictured: set[tuple[int, int, int]] = field(default_factory=set)
     lent: list[list[tuple[dict[str, Any], Any]]] = field(default_factory=list)
+    drawn: int = -1
+    ordered: bool | None = None
+    beside: bool = False
 
     __repr__ = one_line
 
@@ -290,9 +296,6 @@ class SessionState:
         """Raise AlignmentError unless a model has one threshold per Gaussian."""
         rows = len(self.adapter.means(model))
         if rows != len(state.store):
-            raise AlignmentError(
-                where,
-                f"{rows} Gaussians",
-                f"{len(state.store)}, one per threshold",
-                "Report this with the host's commit: its rows changed at no seam.",
-            )
+            expected = f"{len(state.store)}, one per threshold"
+            remedy = "Report this with the host's commit: its rows changed at no seam."
+            raise AlignmentError(where, f"{rows} Gaussians", expected, remedy)

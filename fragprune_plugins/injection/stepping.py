@@ -190,7 +190,7 @@ def begin_step(session: SessionState, model: Any, state: ModelState) -> None:
     """Count a step of the host, and begin a step of stage 2."""
     if state.stage is not None:
         state.stage.close()  # before the count, because an observer may end the run here
-    state.begun = True
+    state.begun, state.beside = True, False
     state.steps += 1
     if session.standing_still(model) and not state.prepared:
         resumed = session.start > 0 or session.origin is not None

@@ -38,12 +38,9 @@ class _WorkerSession(Session):
 
     def _enter(self, seam: Seam, function: Any, instance: Any, args: Any, kwargs: Any) -> Any:
         if seam.role is Role.RASTERIZE:
-            raise SessionError(
-                str(seam),
-                "a spawned worker process that draws",
-                "drawing in the process that trains, which has the thresholds",
-                "Start workers by fork, or draw in the main process.",
-            )
+            expected = "drawing in the process that trains, which has the thresholds"
+            remedy = "Start workers by fork, or draw in the main process."
+            raise SessionError(str(seam), "a spawned worker process that draws", expected, remedy)
         return function(*args, **kwargs)
 
 

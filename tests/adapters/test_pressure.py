@@ -119,3 +119,31 @@ def test_a_target_is_met_over_all_pictures_of_all_views(adapter):
     before, after = torch.stack(counts).sum(dim=0).tolist()
     assert before / after == pytest.approx(1.6, rel=0.015)  # a calibration ends within 0.01
     assert summary.target_reached
+
+
+def test_what_a_viewer_draws_between_two_steps_is_not_learned_from():
+    """3DGS draws for a viewer that is connected with gradients, before the next step begins."""
+    learned = []
+    for shown in (0, 3):
+        with running(Settings(iterations=9, goal=Fewer(1.2), train="opacity")) as host:
+            model, cameras = host.model(40), [host.camera(), host.camera(side=0.3)]
+            for iteration in range(1, 10):
+                for _ in range(shown):
+                    host.render(host.camera(side=-0.5), model)
+                host.step(model, cameras[iteration % 2], iteration)
+            state = host.session.models[model]
+            learned.append((state.store.logits.detach(), len(state.seen), host.finish()))
+    assert torch.equal(learned[0][0], learned[1][0])
+    assert learned[0][1:] == learned[1][1:]
+
+
+def test_a_host_that_steps_several_times_between_two_beginnings_learns_from_all_it_draws():
+    with running(Settings(iterations=9, goal=Pressure(1e-3), train="opacity")) as host:
+        model, camera, other = host.model(40), host.camera(), host.camera(side=0.3)
+        state = host.session.models[model]
+        for iteration in range(1, 4):
+            host.step(model, camera, iteration)
+            image = host.render(other, model)["render"]
+            (image - other.original_image).abs().mean().backward()
+            model.optimizer.step()
+            assert state.stage._views.drawn == (1 if iteration == 1 else 2)
