@@ -223,8 +223,10 @@ class Stage2:
         if share == 0 or not torch.is_grad_enabled():
             return inputs
         opacities = inputs.splats.opacities
-        stream = torch.Generator().manual_seed(hash((self.settings.seed, self.steps)))
-        kept = torch.rand(len(opacities), generator=stream).to(opacities.device) >= share
+        where = opacities.device if opacities.is_cuda else "cpu"  # a GPU would wait for a CPU's
+        stream = torch.Generator(where).manual_seed(hash((self.settings.seed, self.steps)))
+        drawn = torch.rand(len(opacities), generator=stream, device=where)
+        kept = drawn.to(opacities.device) >= share
         more = (opacities / (1 - share)).clamp(max=OPAQUE)
         splats = replace(inputs.splats, opacities=torch.where(kept, more, 0.0))
         return replace(inputs, splats=splats)

@@ -161,12 +161,14 @@ def removal_error(
     splats = model.splats()
     opacities = splats.opacities.detach().clone().requires_grad_(True)
     splats = replace(splats, opacities=opacities)
-    stream = torch.Generator().manual_seed(0)
+    where = opacities.device if opacities.is_cuda else "cpu"  # a GPU would wait for a CPU's numbers
+    stream = torch.Generator(where).manual_seed(0)
     scores = torch.zeros_like(opacities)
     for view in views:
         inputs = RasterInputs(view, splats, planes=(), **model.rules)
         image = engine.rasterize(inputs, thresholds).image
-        signs = torch.randint(0, 2, image.shape, generator=stream).mul(2).sub(1).to(image)
+        signs = torch.randint(0, 2, image.shape, generator=stream, device=where)
+        signs = signs.mul(2).sub(1).to(image)
         (slope,) = torch.autograd.grad(image, opacities, signs)
         scores += (opacities.detach() * slope).square()
     return scores.detach()
