@@ -37,14 +37,20 @@ def rewritten(
         stage: "auto" for stage 2 after the training, "finetune" for stage 2 alone, of a checkpoint
             or from ``from_iter`` on.
         engine: that draws with thresholds.
+        device: "cpu", "cuda" or "cuda:0".
 
     Raises:
-        UsageError: the arguments ask for another method, or for what ns-train cannot do.
+        UsageError: the arguments ask for another method, or for what ns-train cannot do; or for
+            another GPU than the first.
     """
     if not arguments or arguments[0] not in (HOST, method):
         found = arguments[0] if arguments else "no method"
         instead = ELSEWHERE.get(found, HOST)
         raise UsageError("ns-train", found, HOST, f"Train with: ns-train {instead} ...")
+    kind, _, number = device.partition(":")
+    if int(number or 0):
+        found, remedy = "ns-train, which names the first GPU", f"Set CUDA_VISIBLE_DEVICES={number}."
+        raise UsageError(f"--device {device}", found, "--device cuda", remedy)
     given, rest = _split_off(arguments[1:], LENGTH)
     loads = any(_flag(word) in LOADS for word in rest)
     if any(_flag(word) == "--load-config" for word in rest):
@@ -84,7 +90,7 @@ def rewritten(
     ours |= {f"{MODEL}.fragprune.{name}": value for name, value in flags_of(settings).items()}
     if engine != "auto":
         ours[f"{MODEL}.fragprune-engine"] = engine
-    ours |= {LENGTH: total, "--machine.device-type": device.split(":")[0]}
+    ours |= {LENGTH: total, "--machine.device-type": kind}
     flags = [word for flag, value in ours.items() for word in (flag, str(value))]
     return [method, *flags, *rest]
 

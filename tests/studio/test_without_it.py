@@ -66,7 +66,7 @@ OWN = "--pipeline.model.fragprune"
             {"stage": "finetune", "from_iter": 30},
             {"--max-num-iterations": "50", f"{OWN}-from": "30", f"{OWN}.iterations": "20"},
         ),
-        ([], {"device": "cuda:1"}, {"--machine.device-type": "cuda"}),
+        ([], {"device": "cuda:0"}, {"--machine.device-type": "cuda"}),
         ([], {"device": "cpu", "engine": "cpu"}, {f"{OWN}-engine": "cpu"}),
         ([], {"settings": Settings(train="opacity")}, {f"{OWN}.train": "opacity"}),
         ([], {"settings": Settings(goal=Control())}, {f"{OWN}.goal": "control"}),
@@ -96,6 +96,7 @@ def test_a_run_of_splatfacto_is_one_of_ours_that_is_longer_by_stage_two(words, o
         (["splatfacto"], {"stage": "finetune", "from_iter": 30_000}, "--max-num-iterations"),
         (["splatfacto", "--max-num-iterations", "many"], {}, "Correct it"),
         (["splatfacto", "--max-num-iterations"], {}, "Correct it"),
+        (["splatfacto"], {"device": "cuda:1"}, "CUDA_VISIBLE_DEVICES=1"),
     ],
 )
 def test_what_cannot_be_asked_for_is_refused(words, options, remedy):
