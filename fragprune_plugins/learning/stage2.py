@@ -415,7 +415,7 @@ class Stage2:
         views = list(order or self._again)
         for name, figures in (("before", self._before), ("after", self._after)):
             for (view, part), figure in zip(plain[name], tensors.get(name, ()), strict=True):
-                figures[views[view], part] = figure
+                figures[views[view], part] = figure.to(self.store.logits.device)
         put(self, {name: plain[name] for name in _COUNTED})
         if self.target is not None:
             self.target.load_state(plain["target"])

@@ -246,6 +246,17 @@ def test_what_a_stage_kept_gives_the_thresholds_alone(stop, rim):
     assert store.rules == {"stop": stop, "rim": rim}
 
 
+def test_what_was_drawn_before_a_checkpoint_is_counted_on_the_gpu_of_what_is_drawn_after_it():
+    """nerfstudio reads its checkpoints on the CPU; "meta" stands for a GPU."""
+    it = stage()
+    step(it, "a", "b")
+    tensors, plain = it.state_dict("ab")
+    again = Stage2(ThresholdStore(0, "meta"), it.settings)
+    again.load_state_dict(tensors, plain, "ab")
+    kept = [*again._before.values(), *again._after.values()]
+    assert [each.device.type for each in kept] == ["meta"] * 4
+
+
 def test_no_target_makes_fragments_fewer_than_twentyfold():
     it, views = falling(Faster(2.0), 4, "a", target=clocked(2.0, lambda shots: 1.1))
     for _ in range(4):
