@@ -129,24 +129,16 @@ def choose(
         return fitting[0].adapter
     if not fitting:
         others = [a.name for a in adapters if a not in wanted and a.match(repo).fits]
-        raise UnknownHostError(
-            str(repo.root),
-            f"no adapter fits ({_nearest(tried)})",
-            "a codebase that an installed adapter knows",
-            f"Choose {' or '.join(others)}, which fits."
-            if others
-            else "Run fragprune check on the folder to see more, or write an adapter.",
-        )
+        found, expected = f"no adapter fits ({_nearest(tried)})", "one that an adapter knows"
+        remedy = "Run fragprune check on the folder to see more, or write an adapter."
+        remedy = f"Choose {' or '.join(others)}, which fits." if others else remedy
+        raise UnknownHostError(str(repo.root), found, expected, remedy)
     selected = select(repo=repo, matches=[each.match for each in fitting]) if select else None
     for each in fitting:
         if each.adapter.name == selected:
             return each.adapter
-    raise UnknownHostError(
-        str(repo.root),
-        f"several adapters fit: {', '.join(each.adapter.name for each in fitting)}",
-        "one",
-        "Name it with --adapter.",
-    )
+    found = f"several adapters fit: {', '.join(each.adapter.name for each in fitting)}"
+    raise UnknownHostError(str(repo.root), found, "one", "Name it with --adapter.")
 
 
 def _nearest(tried: Sequence[Attempt]) -> str:

@@ -183,7 +183,7 @@ class SessionState:
             return found
         models = {**dict.fromkeys(self.models), **dict.fromkeys(self.optimizers)}
         known = ((model, self.adapter.means(model)) for model in models)
-        return next((m for m, means in known if means.data_ptr() == found.data_ptr()), None)
+        return next((m for m, means in known if _are(found, means)), None)
 
     def standing_still(self, model: Any) -> bool:
         """Whether the model is frozen, because stage 2 has begun."""
@@ -299,3 +299,10 @@ class SessionState:
             expected = f"{len(state.store)}, one per threshold"
             remedy = "Report this with the host's commit: its rows changed at no seam."
             raise AlignmentError(where, f"{rows} Gaussians", expected, remedy)
+
+
+def _are(found: Tensor, means: Tensor) -> bool:
+    """Whether a tensor is a model's means, or a copy of them from a GPU, such as hosts save."""
+    if found.device == means.device or found.shape != means.shape:
+        return found.data_ptr() == means.data_ptr()
+    return torch.equal(found, means.detach().to(found.device))

@@ -3,6 +3,7 @@
 import logging
 from types import SimpleNamespace
 
+import elsewhere
 import pytest
 import torch
 from core.sessions import Model, follow, state
@@ -31,6 +32,20 @@ def test_an_engine_is_opened_once_for_a_device_and_a_slow_one_is_told(
     assert asked == [("auto", device, session.plugins) for device in devices]
     said = " ".join(each.message for each in caplog.records)
     assert [said.count(f"draws on {device}:") for device in devices] == [int(warned)] * 2
+
+
+@pytest.mark.skipif(torch.__version__ < "2.5", reason="no such device can be made")
+def test_a_copy_that_a_host_takes_from_a_gpu_to_save_it_is_its_models():
+    """``{name: each.cpu()}``; on a CPU that is the tensor itself."""
+    session = state()
+    model, other = follow(session)[0], follow(session)[0]
+    with elsewhere.there(), torch.no_grad():
+        other.xyz += 1
+        for each in (model, other):
+            each.xyz = each.xyz.detach().to(elsewhere.DEVICE)
+        session.adapter.model_of = lambda call: call
+        assert session.model_of(other.xyz.cpu()) is other
+        assert session.model_of(other.xyz.cpu() + 1) is None
 
 
 def saved(session):
