@@ -52,12 +52,9 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
     repo, adapter = _host(script, module, options.adapter, plugins)
     trainer = adapter.trainer(repo, script)
     if trainer is None:
-        raise UsageError(
-            "fragprune run",
-            f"{adapter.info.title}, a library without a training command",
-            usage(adapter, repo),
-            f"See the how-to page of {adapter.name}.",
-        )
+        found = f"{adapter.info.title}, a library without a training command"
+        remedy = f"See the how-to page of {adapter.name}."
+        raise UsageError("fragprune run", found, usage(adapter, repo), remedy)
     if not isinstance(trainer, ScriptAdapter):
         summary: RunSummary = trainer(script, arguments, module, options)
         return summary
@@ -102,12 +99,10 @@ def _expect_engine(
     if options.engine != "auto":
         engine_for(options.engine, device, plugins)
     elif device != "cpu" and options.stage != "off" and not adapter.on_gpu:
-        raise UsageError(
-            f"--device {device}",
-            f"{adapter.info.title}, whose Gaussians our cuda engine cannot draw",
-            "--device cpu, or --engine reference, which is slow",
-            "Train with --stage off on the GPU; then learn with --stage finetune --device cpu.",
-        )
+        found = f"{adapter.info.title}, whose Gaussians our cuda engine cannot draw"
+        expected = "--device cpu, or --engine reference, which is slow"
+        remedy = "Train with --stage off on the GPU; then learn with --stage finetune --device cpu."
+        raise UsageError(f"--device {device}", found, expected, remedy)
 
 
 def _expect_trainable(

@@ -81,19 +81,23 @@ def _read_or_prove(
     file = sys.modules[call.seam.module].__file__
     kept = file_of(digest_of(Path(file)), key) if file else None
     proof = read(kept) if kept else None
+    expected = f"what {session.adapter.name} draws, forward and backward"
     if proof is None:
-        proof = prover.prove(call, replace(drawn, engine=engine), shape[1])
+        try:
+            proof = prover.prove(call, replace(drawn, engine=engine), shape[1])
+        except RuntimeError as error:
+            if type(error).__name__ != "OutOfMemoryError":  # torch's: check needs none of torch
+                raise
+            found = f"no room on the GPU to draw it both ways ({str(error).partition('. GPU')[0]})"
+            remedy = "Free memory of the GPU. With --trust nobody compares."
+            raise ProofError(str(call.seam), found, expected, remedy) from error
         if kept:
             keep(proof, kept)
     if proof.failed:
-        raise ProofError(
-            proof.call,
-            proof.failed,
-            f"what {session.adapter.name} draws, forward and backward",
-            "Thresholds would learn from other pictures than its own. fragprune check says whether "
-            "its PLY is plain 3DGS, which fragprune finetune prunes; --stage off trains without "
-            "thresholds, and --trust with them all the same.",
-        )
+        remedy = "Thresholds would learn from other pictures than its own. fragprune check says "
+        remedy += "whether its PLY is plain 3DGS, which fragprune finetune prunes; --stage off "
+        remedy += "trains without thresholds, and --trust with them all the same."
+        raise ProofError(proof.call, proof.failed, expected, remedy)
     log.info("proved: %s", proof)
     return proof
 

@@ -326,16 +326,29 @@ def test_a_proof_that_found_no_memory_counts_as_none(host, monkeypatch):
     prove = RasterizerProver.prove
 
     def without_memory(*_):
-        raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB. GPU 0 has")
 
-    with running(host("dilation"), learn=True) as session:
+    folder = host("dilation")
+    monkeypatch.setattr(RasterizerProver, "prove", without_memory)
+    assert draw(folder, learn=True, trust=True) == [None]
+    with running(folder, learn=True) as session:
         model, camera = session.model(40), session.camera(96, 64)
-        monkeypatch.setattr(RasterizerProver, "prove", without_memory)
-        with pytest.raises(torch.cuda.OutOfMemoryError):
+        with pytest.raises(ProofError, match=r"no room on the GPU .*2 GiB\).*--trust"):
             session.render(camera, model)
         monkeypatch.setattr(RasterizerProver, "prove", prove)
-        with pytest.raises(ProofError):
+        with pytest.raises(ProofError, match="another picture"):
             session.render(camera, model)
+
+
+def test_a_proof_that_fails_by_itself_counts_as_none_either(host, monkeypatch):
+    made = []
+    monkeypatch.setattr(RasterizerProver, "prove", lambda *_: made.append(1) or 1 / 0)
+    with running(host("none"), learn=True) as session:
+        model, camera = session.model(40), session.camera(96, 64)
+        for _ in range(2):
+            with pytest.raises(ZeroDivisionError):
+                session.render(camera, model)
+    assert len(made) == 2
 
 
 def test_a_stand_in_proves_nothing_and_says_so_once(caplog):
