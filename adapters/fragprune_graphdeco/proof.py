@@ -188,13 +188,16 @@ class _Trial:
         if band in own:  # black points lie where colours are cut, and rounding says on which side
             own[band] = own[band].detach().clone(memory_format=torch.contiguous_format)
             own[band].view(count, -1)[:, :3] += _FROM_BLACK
+        here = torch.device("cpu")  # whatever the host makes torch's default
         with torch.enable_grad():
-            chart = likeness.chart(own, self.dialect.unpack(self.drawn).view)
+            with here:
+                chart = likeness.chart(own, self.dialect.unpack(self.drawn).view)
             both = [
                 self._draw("the host's own call", own, settings, likeness.OWN),
                 self._draw("a chart through its camera", chart, self._for_the_chart(), 1),
             ]
-            found = [self._output(number, both) for number in range(len(both[0].theirs))]
+            with here:
+                found = [self._output(number, both) for number in range(len(both[0].theirs))]
         made = {number: name for number, (name, new) in enumerate(found) if new}
         return Proof(self.where, tuple(name for name, _ in found), made)
 

@@ -1,5 +1,6 @@
 """A host's own rasterizer is compared with our engine before anything is trained."""
 
+import contextlib
 import json
 import logging
 import shutil
@@ -13,6 +14,7 @@ from cli.commands import run_json
 from miniatures import compiled, vanilla_3dgs
 from miniatures.compiled import DIFFERENCES
 
+from fragprune_graphdeco import likeness, proof
 from fragprune_graphdeco.proof import RasterizerProver
 from fragprune_plugins import Pressure, Settings
 from fragprune_plugins.engines.reference import ReferenceEngine
@@ -349,6 +351,32 @@ def test_a_proof_that_fails_by_itself_counts_as_none_either(host, monkeypatch):
             with pytest.raises(ZeroDivisionError):
                 session.render(camera, model)
     assert len(made) == 2
+
+
+def test_a_host_may_have_torch_make_tensors_elsewhere(host, monkeypatch):
+    """On a GPU by default, where numbers from a generator on the CPU are refused."""
+    chart, gradient = likeness.chart, proof._gradient
+    made = []
+
+    def there(function):
+        def called(*given):
+            made.append(torch.empty(0).device.type)
+            return function(*given)
+
+        return called
+
+    monkeypatch.setattr(likeness, "chart", there(chart))
+    monkeypatch.setattr(proof, "_gradient", there(gradient))
+    prove = RasterizerProver.prove
+
+    def by_a_host(*given):
+        with torch.device("meta"):
+            return prove(*given)
+
+    monkeypatch.setattr(RasterizerProver, "prove", by_a_host)
+    with contextlib.suppress(NotImplementedError, RuntimeError):  # our engine draws for the host
+        draw(host("none"))
+    assert set(made) == {"cpu"}
 
 
 def test_a_stand_in_proves_nothing_and_says_so_once(caplog):
