@@ -1,6 +1,7 @@
 """fragprune compare and profile."""
 
 import importlib
+from dataclasses import replace
 
 import pytest
 import torch
@@ -37,6 +38,17 @@ def test_a_long_measurement_shows_how_far_it_is(tmp_path, monkeypatch, silent, s
     for words in ("measuring:", "timing frames:"):
         assert (words in result.stderr) is shows
         assert words not in result.stdout
+
+
+def test_a_model_of_which_nothing_is_seen_has_no_speedup(tmp_path):
+    data, path, model = tiny.scene(tmp_path)
+    away = tmp_path / "away.ply"
+    write_ply(away, replace(model, xyz=model.xyz + 1e4))
+    report = run_json("compare", path, away, "--data", data)
+    assert report["b"]["fragments_per_pixel"] == 0
+    assert report["speedup"] is None
+    text = run("compare", path, away, "--data", data).stdout
+    assert "B against A: no fragments (" in text
 
 
 def test_frames_are_timed_at_another_size(tmp_path, monkeypatch):

@@ -59,7 +59,13 @@ def test_frames_are_called_faster_only_beyond_two_standard_errors(ms, error, cla
 
 @pytest.mark.parametrize(
     ("now", "figure", "word"),
-    [(10.0, "2.0x", "fewer"), (19.0, "1.05x", "fewer"), (40, "2.0x", "more")],
+    [
+        (10.0, "2.0x", "fewer"),
+        (19.0, "1.05x", "fewer"),
+        (19.98, "1.00x", "as many"),
+        (20.0, "1.00x", "as many"),
+        (40, "2.0x", "more"),
+    ],
 )
 def test_a_headline_of_fragments_says_fewer_or_more(now, figure, word):
     first, *_ = headlines({"before": measured(20, 3, 30), "after": measured(now, 3, 30)}, None)
@@ -69,6 +75,15 @@ def test_a_headline_of_fragments_says_fewer_or_more(now, figure, word):
 def test_more_fragments_are_not_called_fewer():
     assert fewer(10.0, 25.0) == "2.50x more fragments (10.0 -> 25.0 per pixel)"
     assert fewer(25.0, 25.1) == "as many fragments (25.0 -> 25.1 per pixel)"
+
+
+@pytest.mark.parametrize(
+    ("was", "now", "said"), [(10.6, 0.0, "no"), (0.0, 10.6, "more"), (0.0, 0.0, "as many")]
+)
+def test_where_nothing_is_drawn_there_is_no_ratio(was, now, said):
+    assert fewer(was, now) == f"{said} fragments ({was:.1f} -> {now:.1f} per pixel)"
+    first, *_ = headlines({"before": measured(was, 3, 30), "after": measured(now, 3, 30)}, None)
+    assert first == (f"{was:.1f} → {now:.1f}", "fragments to draw a pixel")
 
 
 @pytest.mark.parametrize("command", ["run", "finetune"])

@@ -159,7 +159,7 @@ def _tables(figures: Mapping[str, Any]) -> list[page.Table]:
         [
             cut["name"],
             f"{cut['fragments_per_pixel']:.2f}",
-            f"{first / max(cut['fragments_per_pixel'], 1e-9):.2f}x",
+            _ratio(first, cut["fragments_per_pixel"]),
             _decibels(cut["psnr"]),
             _decibels(cut["worst_psnr"]),
             f"{cut['frame_ms']:.2f} ± {cut['frame_ms_se']:.2f}",
@@ -212,6 +212,10 @@ def _kinds(idle: Mapping[str, Any]) -> page.Table:
 
 def _part(reason: Mapping[str, Any]) -> str:
     return f"{reason['idle'] / reason['share']:.0%}" if reason["share"] else ""
+
+
+def _ratio(first: float, drawn: float) -> str:
+    return f"{first / drawn:.2f}x" if drawn else ""
 
 
 def _decibels(value: float | None) -> str:

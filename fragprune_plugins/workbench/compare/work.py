@@ -80,7 +80,7 @@ def _figures(
         "a": {"model": a} | before,
         "b": {"model": b} | after,
         "target": after["target"],
-        "speedup": drawn[0] / max(drawn[1], 1e-9),
+        "speedup": drawn[0] / drawn[1] if drawn[1] else None,
         "psnr_change": after["psnr"] - before["psnr"],
         "ssim_change": after["ssim"] - before["ssim"],
         "engine": after["engine"],

@@ -206,7 +206,12 @@ def headlines(data: Mapping[str, Any], control: dict[str, Any] | None) -> list[t
 
 def _drawn(was: float, now: float) -> tuple[str, str]:
     """The ratio of fragments per pixel, and what it says."""
-    ratio, word = (was / max(now, 1e-9), "fewer") if was >= now else (now / max(was, 1e-9), "more")
+    least, most = sorted((was, now))
+    if not least:
+        return f"{was:.1f} → {now:.1f}", "fragments to draw a pixel"
+    ratio, word = most / least, "fewer" if was > now else "more"
+    if ratio - 1 < _EQUAL:
+        word = "as many"
     figure = f"{ratio:.2f}x" if ratio < 1.1 else f"{ratio:.1f}x"
     return figure, f"{word} fragments to draw: {was:.1f} → {now:.1f} a pixel"
 
@@ -299,17 +304,18 @@ def unrelated(a: dict[str, Any], b: dict[str, Any]) -> list[str]:
 
 
 def fewer(before: float, after: float) -> str:
-    """A phrase for the ratio of fragments per pixel: fewer, as many or more."""
-    change = _less(before, after).replace("the same", "as many")
+    """A phrase for the ratio of fragments per pixel: fewer, as many, more or none."""
+    change = _less(before, after).replace("the same", "as many").replace("none", "no")
     return f"{change} fragments ({before:.1f} -> {after:.1f} per pixel)"
 
 
 def _less(before: float, after: float, word: str = "fewer") -> str:
-    """The ratio of two figures in words."""
-    ratio = before / max(after, 1e-9)
-    if abs(ratio - 1) < _EQUAL:
+    """The ratio of two figures in words; nothing has no ratio."""
+    if before == after or (before and abs(before / max(after, 1e-9) - 1) < _EQUAL):
         return "the same"
-    return f"{ratio:.2f}x {word}" if ratio > 1 else f"{1 / max(ratio, 1e-9):.2f}x more"
+    if not before or not after:
+        return "more" if after else "none"
+    return f"{before / after:.2f}x {word}" if before > after else f"{after / before:.2f}x more"
 
 
 def _fast(before: dict[str, Any], after: dict[str, Any]) -> str:
