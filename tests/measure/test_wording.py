@@ -57,6 +57,12 @@ def test_frames_are_called_faster_only_beyond_two_standard_errors(ms, error, cla
         assert said == f"as fast: frames in 3.00 → {ms:.2f} ms"
 
 
+def test_noise_is_noise_whichever_of_the_two_comes_first():
+    quiet, noisy = measured(20, 1.0, 30, 0.0), measured(20, 1.6, 30, 0.35)
+    for pair in ((quiet, noisy), (noisy, quiet)):
+        assert "no difference beyond the noise" in gain(*pair)
+
+
 @pytest.mark.parametrize(
     ("now", "figure", "word"),
     [
