@@ -197,6 +197,8 @@ def measured(goal, psnr=30.0, iterations=3, keep=None, **settings):
         ({"keep": 0.5}, {"keep": 0.5}, True),
         ({}, {"keep": 0.5}, True),
         ({"keep": 0.5}, {}, False),
+        *(({"dropout": share}, {"dropout": 0.2}, True) for share in (None, 0.0, 0.2)),
+        *(({"dropout": 0.3}, {"dropout": share}, False) for share in (None, 0.2)),
         ({}, {"views_per_step": 2}, False),
         ({}, {"seed": 1}, False),
         ({}, {"iterations": 4}, False),
