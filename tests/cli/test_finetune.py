@@ -183,11 +183,12 @@ def test_what_a_model_itself_can_spare_is_not_known(words):
 ALIKE = {"train": "all", "opacity_lr": None, "seed": 0, "views_per_step": 1}
 
 
-def measured(goal, psnr=30.0, iterations=3, keep=None, **settings):
+def measured(goal, psnr=30.0, iterations=3, keep=None, adapter=None, **settings):
     """A record's data of a training that began with so many dB."""
     begun = {"views": 2, "gaussians": 60, "psnr": psnr}
     figures = {"before": begun, "after": begun | {"goal": goal}, "iterations": iterations}
-    return figures | {"keep": keep, "settings": ALIKE | {"goal": goal} | settings}
+    figures |= {"keep": keep, "adapter": adapter}
+    return figures | {"settings": ALIKE | {"goal": goal} | settings}
 
 
 @pytest.mark.parametrize(
@@ -202,6 +203,9 @@ def measured(goal, psnr=30.0, iterations=3, keep=None, **settings):
         ({}, {"views_per_step": 2}, False),
         ({}, {"seed": 1}, False),
         ({}, {"iterations": 4}, False),
+        ({}, {"adapter": "vanilla-3dgs"}, False),
+        ({"adapter": "vanilla-3dgs"}, {}, False),
+        ({"adapter": "vanilla-3dgs"}, {"adapter": "vanilla-3dgs"}, True),
         ({}, {"psnr": 30.1}, False),
         ({"stop": 0.01}, {"stop": 0.01}, False),
         *(({}, {"stop": stop}, True) for stop in (None, "auto", 0.02)),

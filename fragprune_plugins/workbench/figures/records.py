@@ -141,9 +141,9 @@ def _spellings(path: str | Path) -> list[str]:
 def control_of(data: dict[str, Any], among: Sequence[Path]) -> dict[str, Any] | None:
     """Find the measurement of a fine-tuning's control; None if no file records it.
 
-    The control started from the same model, with the same iterations, views in each step, seed and
-    settings, and kept as many Gaussians or all, but without truncation and without a stop or a
-    dropout of its own.
+    The control started from the same model, by the same host's loop or ours, with the same
+    iterations, views in each step, seed and settings, and kept as many Gaussians or all, but
+    without truncation and without a stop or a dropout of its own.
     Files that are not records are ignored.
 
     Args:
@@ -168,6 +168,7 @@ def _is_control(other: dict[str, Any], data: dict[str, Any]) -> bool:
         and all(mine[key] == theirs.get(key) for key in _OF_CONTROLS)
         and theirs.get("stop") in (None, "auto")
         and theirs.get("dropout") in (None, 0, mine.get("dropout"))
+        and other.get("adapter") == data.get("adapter")
         and other["iterations"] == data["iterations"]
         and other.get("keep") in (None, data.get("keep"))
         and begun
