@@ -68,6 +68,13 @@ def test_control_shows_what_as_many_iterations_give_without_pruning(demo):
     assert f"{gain:+.2f} dB: pruning itself makes" in outcome("run", report, report["control"])
 
 
+def test_the_control_is_the_hosts_own_training_resumed_from_the_same_checkpoint(demo):
+    out, report, _ = demo
+    (control,) = (out / "model" / "control").rglob("point_cloud.ply")
+    measured = run_json("compare", report["model_before"], control, "--data", out / "scene")
+    assert measured["b"]["psnr"] == pytest.approx(report["control"]["psnr"], abs=1e-4)
+
+
 def test_pictures_and_page_are_there(demo):
     out, report, _ = demo
     for file in report["files"]:

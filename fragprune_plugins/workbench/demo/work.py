@@ -34,7 +34,6 @@ from fragprune_plugins.workbench.figures.evaluate import (
 )
 from fragprune_plugins.workbench.figures.recorded import Recorded
 from fragprune_plugins.workbench.figures.wording import begun, describe, frames, headlines, outcome
-from fragprune_plugins.workbench.finetune.api import finetune
 from fragprune_plugins.workbench.finetune.trial import Trial
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.report import page as report_page
@@ -162,14 +161,13 @@ def run_demo(
     assert summary.model_before is not None  # the host saves at its last iteration
     assert summary.model_after is not None
     pair = summary.model_before, summary.model_after
-    before, after = (models.load(path, device=settings.device) for path in pair)
-    with _timed(seconds, "control"):
+    with _timed(seconds, "control"), claiming(out, "model"):
         say(f"2/4  The control: the same {settings.finetune} iterations without cutoffs")
-        given = before, load_dataset(scene), replace(learning, goal=Control())
-        control = finetune(*given, engine=settings.engine, progress=True).model
+        zero = _control(command, options)
     with _timed(seconds, "measure"):
         say("3/4  Measuring on the held-out views")
-        candidates = [Candidate(each) for each in (before, after, control)]
+        loaded = (models.load(path, device=settings.device) for path in (*pair, zero))
+        candidates = [Candidate(each) for each in loaded]
         report = _measure(scene, candidates, settings, summary, looking.trial)
     with _timed(seconds, "pictures"), claiming(out, "pictures", "index.html", "model"):
         say("4/4  Drawing the pictures")
@@ -183,6 +181,15 @@ def run_demo(
     with claiming(out, REPORT), replacing(out / REPORT) as path:
         path.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     return report
+
+
+def _control(command: list[str], options: RunOptions) -> Path:
+    """The model that the host's stage 2 gives from the same checkpoint without cutoffs."""
+    settings = replace(options.settings, goal=Control())
+    with contextlib.redirect_stdout(sys.stderr):
+        summary = run(command, replace(options, stage="finetune", settings=settings, look=None))
+    assert summary.model_after is not None
+    return summary.model_after
 
 
 def _measure(
