@@ -256,6 +256,16 @@ def test_a_bound_on_the_loss_trains_the_control_and_names_the_views(words, out):
     assert "chosen on these 2 views" in text
 
 
+def test_an_interrupted_search_quotes_no_control_that_trained_for_longer(words, monkeypatch):
+    tiny.at_loss(monkeypatch, 6 + 4, lambda: signal.raise_signal(signal.SIGINT))
+    result = run(*words, 6, "--max-drop", 5, "--json")
+    assert result.exit_code == 130
+    report = json.loads(result.stdout)
+    assert report["iterations"] < 6
+    assert report["control"] is None
+    assert report["untruncated"]["fragments_per_pixel"] > report["after"]["fragments_per_pixel"]
+
+
 def test_sigterm_saves_at_once_and_leaves_with_143(words, out, monkeypatch):
     before = signal.getsignal(signal.SIGTERM)
 

@@ -117,8 +117,11 @@ class Finetuned:
         """What the record and ``--json`` say, from figures as ``measured``."""
         asked, result, settings = self.asked, self.result, self.result.settings
         before, after, *without = figures
-        control = without.pop() if self.found is not None else None
-        done = result.progress
+        control, done = None, result.progress
+        if self.found is not None:
+            longer = self.found.control.progress.steps > done.steps  # where that was interrupted
+            control = None if longer else without[-1]
+            del without[-1]
         data: dict[str, Any] = {
             "model": str(asked.model),
             "out": str(asked.out),
