@@ -256,6 +256,15 @@ def test_a_bound_on_the_loss_trains_the_control_and_names_the_views(words, out):
     assert "chosen on these 2 views" in text
 
 
+def test_figures_of_a_model_do_not_outlive_it(words, out, monkeypatch):
+    """SIGTERM leaves no time to measure what takes its place."""
+    run_json(*words, 5)
+    assert records.beside(out) is not None
+    tiny.at_loss(monkeypatch, 3, lambda: signal.raise_signal(signal.SIGTERM))
+    assert run(*words, 50).exit_code == 143
+    assert records.files(out.parent) == []
+
+
 def test_an_interrupted_search_quotes_no_control_that_trained_for_longer(words, monkeypatch):
     tiny.at_loss(monkeypatch, 6 + 4, lambda: signal.raise_signal(signal.SIGINT))
     result = run(*words, 6, "--max-drop", 5, "--json")

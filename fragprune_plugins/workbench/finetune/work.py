@@ -20,6 +20,7 @@ from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import OwnCameras, open_engine, photographs_for
 from fragprune_plugins.workbench.commands.options import require_several
 from fragprune_plugins.workbench.distributed import ShardedEngine, part_of, whole_of
+from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.figures.evaluate import Candidate, psnrs
 from fragprune_plugins.workbench.finetune import api, resuming
 from fragprune_plugins.workbench.finetune import finished as finetuned
@@ -159,6 +160,7 @@ def _learned(opened: _Opened, ranks: Ranks, lost: float | None) -> tuple[Finetun
     result, found = _learn(left, opened, engine, ranks)
     saved = whole_of(result.model, ranks) if asked.shard else result.model
     if ranks.first:
+        records.path_beside(asked.out).unlink(missing_ok=True)  # of the file that was there
         models.save(asked.out, saved)
     over = Finetuned(
         asked,
