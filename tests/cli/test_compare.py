@@ -68,6 +68,9 @@ def test_frames_are_timed_at_another_size(tmp_path, monkeypatch):
     assert [report["a"][key] for key in FIGURES] == [plain["a"][key] for key in FIGURES]
     text = run("compare", path, path, "--data", data, "--enlarge", 3).stdout
     assert "Frames of 96x96 pixels." in text
+    assert ", frames of 3x the size 1.00 -> 1.00 ms (" in text
+    run_json("compare", path, path, "--data", data, "--enlarge", 3, "--out", tmp_path / "out")
+    assert ", frames of 3x the size 1.00 -> " in run_json("report", tmp_path / "out")["result"]
 
 
 def test_without_photographs_b_is_compared_with_what_a_shows(tmp_path):

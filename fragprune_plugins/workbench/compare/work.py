@@ -102,7 +102,7 @@ def _lines(
         f"A: {a}\nB: {b}\n{pictures}: {shown}, {width}x{height} pixels\n",
         wording.describe({"A": before, "B": after}),
         *([f"Frames of {enlarge * width}x{enlarge * height} pixels."] if enlarge > 1 else []),
-        f"\nB against A: {wording.gain(before, after)}.",
+        f"\nB against A: {wording.gain(before, after, enlarge)}.",
         *(f"Warning: {each}" for each in report["warnings"]),
     ]
 

@@ -119,11 +119,15 @@ def nothing_drawn(fragments: Sequence[float]) -> list[str]:
     ]
 
 
-def gain(before: dict[str, Any], after: dict[str, Any]) -> str:
-    """A phrase for the gain of one measurement over another: fragments, frame times, PSNR."""
+def gain(before: dict[str, Any], after: dict[str, Any], enlarge: int = 1) -> str:
+    """A phrase for the gain of one measurement over another: fragments, frame times, PSNR.
+
+    Args:
+        enlarge: timed frames are this many times as wide and high as the pictures.
+    """
     return (
         f"{fewer(before['fragments_per_pixel'], after['fragments_per_pixel'])}, "
-        f"{frames(before, after)}, {_quality(before, after)} on {after['views']} views"
+        f"{frames(before, after, enlarge)}, {_quality(before, after)} on {after['views']} views"
     )
 
 
@@ -324,11 +328,12 @@ def _fast(before: dict[str, Any], after: dict[str, Any]) -> str:
     return f"{ratio:.2f}x as fast" if claimed else "within noise"
 
 
-def frames(before: dict[str, Any], after: dict[str, Any]) -> str:
+def frames(before: dict[str, Any], after: dict[str, Any], enlarge: int = 1) -> str:
     """A phrase for frame times, with their ratio only if it exceeds the standard errors."""
     ratio, error, claimed = _faster(before, after)
     faster = f"{ratio:.2f} ± {error:.2f}x as fast" if claimed else "no difference beyond the noise"
-    return f"frames {before['frame_ms']:.2f} -> {after['frame_ms']:.2f} ms ({faster})"
+    of = f" of {enlarge}x the size" if enlarge > 1 else ""
+    return f"frames{of} {before['frame_ms']:.2f} -> {after['frame_ms']:.2f} ms ({faster})"
 
 
 def _faster(before: dict[str, Any], after: dict[str, Any]) -> tuple[float, float, bool]:

@@ -149,7 +149,7 @@ def _sentence(record: Record, among: Sequence[Path]) -> str:
     if record.command == "compare":
         of = f"A is {data['a']['model']}, B is {data['b']['model']}: "
     if len(columns) > 1:
-        return f"{of}{wording.gain(columns[0], columns[-1])}."
+        return f"{of}{wording.gain(columns[0], columns[-1], data.get('enlarge', 1))}."
     if columns:
         drawn, frame = columns[0]["fragments_per_pixel"], columns[0]["frame_ms"]
         return f"{drawn:.1f} fragments per pixel drawn, frames of {frame:.2f} ms."
