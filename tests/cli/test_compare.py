@@ -7,6 +7,7 @@ import pytest
 import torch
 from cli.commands import run, run_json
 from finetune import tiny
+from PIL import Image
 
 from fragprune_plugins import RasterInputs, load_cameras, rasterize
 from fragprune_plugins.workbench.figures import evaluate
@@ -71,6 +72,16 @@ def test_frames_are_timed_at_another_size(tmp_path, monkeypatch):
     assert ", frames of 3x the size 1.00 -> 1.00 ms (" in text
     run_json("compare", path, path, "--data", data, "--enlarge", 3, "--out", tmp_path / "out")
     assert ", frames of 3x the size 1.00 -> " in run_json("report", tmp_path / "out")["result"]
+
+
+def test_views_of_several_sizes_are_not_said_to_have_one(tmp_path):
+    data, path, _ = tiny.scene(tmp_path)
+    _, held_out = sorted((data / "images").iterdir())[::8]
+    with Image.open(held_out) as picture:
+        picture.resize((2 * tiny.SIDE, 2 * tiny.SIDE)).save(held_out)
+    text = run("compare", path, path, "--data", data, "--enlarge", 2).stdout
+    assert ", 32x32 to 64x64 pixels" in text
+    assert "Frames of 64x64 to 128x128 pixels." in text
 
 
 def test_without_photographs_b_is_compared_with_what_a_shows(tmp_path):

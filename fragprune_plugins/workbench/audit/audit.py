@@ -30,6 +30,7 @@ from fragprune_plugins.types import View, one_line
 from fragprune_plugins.workbench.figures import extents
 from fragprune_plugins.workbench.figures.evaluate import Candidate, frame_times
 from fragprune_plugins.workbench.figures.metrics import psnr
+from fragprune_plugins.workbench.figures.wording import sizes
 from fragprune_plugins.workbench.scenes.generated import Named
 
 HALF_LEVEL = 0.5 / 255
@@ -293,20 +294,13 @@ class _Survey:
             "views": len(self._overdraw),
             "overdraw": statistics.fmean(self._overdraw),
             **{name: cuts[0][name] for name in same},
-            "frame_size": _sizes(self.shown),
+            "frame_size": sizes([(*each.fragments.shape[::-1],) for each in self.shown]),
             "engine": self._engine.name,
             "device": str(self._model.device),
             "idle": self._idle.as_dict(),
             "cuts": cuts,
             "viewers": _viewers(self._asked),
         }
-
-
-def _sizes(timed: Sequence[Shown]) -> str:
-    """WIDTHxHEIGHT of the timed views; of the smallest and the largest, if they differ."""
-    sizes = sorted((*each.fragments.shape,) for each in timed)
-    ends = dict.fromkeys(f"{width}x{height}" for height, width in (sizes[0], sizes[-1]))
-    return " to ".join(ends)
 
 
 def _middles(count: int) -> list[int]:

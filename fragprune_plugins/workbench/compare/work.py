@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +64,7 @@ def compare(
     before, after = measure_all(candidates, shots, engine=rasterizer, enlarge=enlarge)
     measured = [(str(a), before), (str(b), after)]
     report = _figures(measured, enlarge, photographs)
-    lines = _lines(measured, report, shown, shots[0].view)
+    lines = _lines(measured, report, shown, [shot.view for shot in shots])
     if out is not None:
         columns = dict(zip("AB", candidates, strict=True))
         lines.append(leave_panels(out, "compare", report, columns, shots, rasterizer))
@@ -92,16 +93,23 @@ def _figures(
 
 
 def _lines(
-    measured: list[tuple[str, dict[str, Any]]], report: dict[str, Any], shown: str, view: View
+    measured: list[tuple[str, dict[str, Any]]],
+    report: dict[str, Any],
+    shown: str,
+    views: Sequence[View],
 ) -> list[str]:
     """What a person reads."""
     (a, before), (b, after) = measured
-    width, height, enlarge = view.width, view.height, report["enlarge"]
+    enlarge = report["enlarge"]
+    size, large = (
+        wording.sizes([(times * view.width, times * view.height) for view in views])
+        for times in (1, enlarge)
+    )
     pictures = "Photographs" if report["scene"] else "Pictures"
     return [
-        f"A: {a}\nB: {b}\n{pictures}: {shown}, {width}x{height} pixels\n",
+        f"A: {a}\nB: {b}\n{pictures}: {shown}, {size} pixels\n",
         wording.describe({"A": before, "B": after}),
-        *([f"Frames of {enlarge * width}x{enlarge * height} pixels."] if enlarge > 1 else []),
+        *([f"Frames of {large} pixels."] if enlarge > 1 else []),
         f"\nB against A: {wording.gain(before, after, enlarge)}.",
         *(f"Warning: {each}" for each in report["warnings"]),
     ]

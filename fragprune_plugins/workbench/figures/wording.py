@@ -108,6 +108,12 @@ def tabulate(columns: Mapping[str, dict[str, Any]]) -> list[list[str]]:
     return rows
 
 
+def sizes(pictures: Sequence[tuple[int, ...]]) -> str:
+    """WIDTHxHEIGHT of pictures; of the smallest and the largest, if they differ."""
+    ends = min(pictures), max(pictures)
+    return " to ".join(dict.fromkeys(f"{width}x{height}" for width, height in ends))
+
+
 def nothing_drawn(fragments: Sequence[float]) -> list[str]:
     """A warning where no Gaussian is seen; [] where each view or measurement has some."""
     empty = sum(each == 0 for each in fragments)
