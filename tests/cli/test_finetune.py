@@ -230,6 +230,16 @@ def test_a_control_truncates_nothing_and_is_quoted_by_the_same_training(scene, t
     assert run_json(*arguments, "--out", tmp_path / "pruned.ply")["control"] == report["after"]
 
 
+def test_a_control_that_ran_after_is_quoted_by_the_finished_command(words, tmp_path):
+    assert "no control was run" in run(*words, 6).stdout
+    control = run_json(*words, 6, "--control", "--out", tmp_path / "control.ply")
+    finished = run(*words, 6).stdout
+    assert "was finished before" in finished
+    assert "no control was run" not in finished
+    assert "pruning itself makes" in finished
+    assert run_json(*words, 6)["control"] == control["after"]
+
+
 def test_a_target_time_says_what_was_reached(words, monkeypatch):
     tiny.exact_clock(monkeypatch)
     report = run_json(*words, 20, "--target-time", 1.2)

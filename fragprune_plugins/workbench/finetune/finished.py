@@ -203,8 +203,11 @@ def finished(model: Path, out: Path, asked: dict[str, Any]) -> Report | None:
     if written != out.name:  # a model of the same name in another format
         return None
     data = {key: value for key, value in record.data.items() if key not in _OF_RECORDS}
+    none, since = data.get("control"), records.control_of(data, records.files(out.parent))
+    data["control"] = none or since
+    said, now = (wording.outcome("finetune", data, each) for each in (none, none or since))
     text = (
-        f"{record.data['text']}\n{out} was finished before: nothing was done. "
+        f"{record.data['text'].replace(said, now)}\n{out} was finished before: nothing was done. "
         "--again fine-tunes again."
     )
     given = {"model": str(model), "out": str(out)}  # the record names them from its own folder
