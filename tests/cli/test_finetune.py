@@ -264,6 +264,7 @@ def test_a_bound_on_the_loss_trains_the_control_and_names_the_views(words, out):
     text = run(*asked).stdout
     assert "Loss against the control" in text
     assert "chosen on these 2 views" in text
+    assert "chosen on these 2 views" in run("report", out.parent).stdout
 
 
 def test_figures_of_a_model_do_not_outlive_it(words, out, monkeypatch):

@@ -265,6 +265,21 @@ def begun(data: Mapping[str, Any]) -> list[str]:
     return lines
 
 
+def bounded(data: Mapping[str, Any]) -> str:
+    """A line on what --max-drop found, and on which views."""
+    found = data["max_drop"]
+    if "loss" not in found:
+        return "No training was compared with the control."
+    tried = f"of {len(found['trials'])} trained"
+    chosen = f"the strongest pruning {tried}" if found["met"] else f"the least loss {tried}"
+    missed = "" if found["met"] else f" The bound of {found['bound']:g} dB was missed."
+    return (
+        f"Loss against the control: {found['loss']:.3f} dB at pressure {found['pressure']:.2g}, "
+        f"{chosen}. The pressure was chosen on these {data['after']['views']} views; others of "
+        f"their kind may differ by some {found['loss_se']:.2f} dB.{missed}"
+    )
+
+
 def missed(data: Mapping[str, Any]) -> str:
     """That a fine-tuning missed its target, a sentence with a space before it; else nothing."""
     if data.get("target_reached") is not False:

@@ -87,19 +87,17 @@ class Finetuned:
     def report(
         self,
         figures: Sequence[dict[str, Any]],
-        dataset: Dataset,
         photographs: Photographs | None,
         configuration: dict[str, Any],
     ) -> Report:
         """Leave a record, and say what came of it.
 
         Args:
-            dataset: whose held-out views it was measured on.
             photographs: where they lie, for the record; None where there are none.
             configuration: by which the same command is known again.
         """
         data, asked, result = self._data(figures), self.asked, self.result
-        text = self._text(data, len(dataset.test))
+        text = self._text(data)
         more: dict[str, Any] = {"curves": [asdict(point) for point in result.curves]}
         if asked.itself:
             more["cameras"] = asked.scene.as_record(asked.cameras)
@@ -152,7 +150,7 @@ class Finetuned:
         data["control"] = control or records.control_of(data, records.files(asked.out.parent))
         return data
 
-    def _text(self, data: dict[str, Any], held_out: int) -> str:
+    def _text(self, data: dict[str, Any]) -> str:
         """What a person reads."""
         result, settings, before = self.result, self.result.settings, data["before"]
         pressure = f" at pressure {data['pressure']:.2g}" if settings.goal.presses else ""
@@ -171,7 +169,7 @@ class Finetuned:
                 "includes what they send each other."
             )
         if self.found is not None:
-            lines.append(_describe_bound(data["max_drop"], held_out))
+            lines.append(wording.bounded(data))
         if result.interrupted:
             of = f"{data['iterations']} of {settings.iterations}"
             lines.append(f"Interrupted at {of} iterations. {_goes_on(self.found)}")
@@ -237,20 +235,6 @@ def _goes_on(found: Bounded | None) -> str:
     if found is None:
         return "The same command goes on from there."
     return "With --max-drop the same command begins anew."
-
-
-def _describe_bound(found: dict[str, Any], views: int) -> str:
-    """A line on what --max-drop found."""
-    if "loss" not in found:
-        return "No training was compared with the control."
-    tried = f"of {len(found['trials'])} trained"
-    chosen = f"the strongest pruning {tried}" if found["met"] else f"the least loss {tried}"
-    missed = "" if found["met"] else f" The bound of {found['bound']:g} dB was missed."
-    return (
-        f"Loss against the control: {found['loss']:.3f} dB at pressure {found['pressure']:.2g}, "
-        f"{chosen}. The pressure was chosen on these {views} views; others of their kind may "
-        f"differ by some {found['loss_se']:.2f} dB.{missed}"
-    )
 
 
 def advise(data: dict[str, Any]) -> str | None:

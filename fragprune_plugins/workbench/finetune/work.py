@@ -180,7 +180,7 @@ def _report(opened: _Opened, over: Finetuned, measured: list[dict[str, Any]] | N
     if result.terminated:  # after SIGTERM there is no time for measurements
         return finetuned.terminated(asked.model, asked.out, result, over.found)
     figures = measured or over.measured(opened.dataset, opened.engine)
-    report = over.report(figures, opened.dataset, opened.photographs, opened.configuration)
+    report = over.report(figures, opened.photographs, opened.configuration)
     if not result.interrupted:
         opened.checkpoints.clear()  # not before: a kill while measuring goes on from it too
     return report

@@ -61,8 +61,11 @@ def report(*, folder: Path, out: Path | None, data: Path | None, engine: EngineO
         pictures = Path(name)
         drawn, learning, missing = _draw(main, folder, pictures, data, partial(open_engine, engine))
         more = [*learning, *_files(every, folder, pictures)]
-        begun = wording.begun(main.data) if _compared(main) else []
-        notes = [*begun, *([_ONLY_CONTROLS] if control else []), *([missing] if missing else [])]
+        notes = [
+            *_begun(main),
+            *([_ONLY_CONTROLS] if control else []),
+            *([missing] if missing else []),
+        ]
         text = report_page.compose(
             report_page.TEMPLATE,
             drawn,
@@ -110,6 +113,7 @@ def _check(record: Record) -> None:
         _sentence(record, [])
         _settings(record)
         _facts(record, [])
+        _begun(record)
         for name in record.data.get("files", ()):
             Path(name)
 
@@ -185,6 +189,14 @@ def _facts(record: Record, among: Sequence[Path]) -> list[tuple[str, str]]:
     if not _compared(record):
         return []
     return wording.headlines(data, data.get("control") or records.control_of(data, among))
+
+
+def _begun(record: Record) -> list[str]:
+    """Lines on what came before a fine-tuning that was measured, and on what a bound found."""
+    if not _compared(record):
+        return []
+    bounded = [wording.bounded(record.data)] if record.data.get("max_drop") else []
+    return wording.begun(record.data) + bounded
 
 
 def _compared(record: Record) -> bool:
