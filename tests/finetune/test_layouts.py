@@ -233,6 +233,17 @@ def test_a_file_may_say_which_views_train_and_leave_the_rest_to_us(tmp_path, ima
     assert stems(data.train) == NAMES[1:5]
 
 
+def test_a_mask_that_hides_everything_is_refused(tmp_path, images):
+    """Its PSNR would be infinite, and so the mean over all views."""
+    tiny.write_colmap(tmp_path, images)
+    (tmp_path / "masks").mkdir()
+    black = Image.new("L", (tiny.SIDE, tiny.SIDE))
+    black.save(tmp_path / "masks" / "view08.png")
+    data = load_dataset(tmp_path)
+    with pytest.raises(DatasetError, match="black everywhere"):
+        measure(tiny.random_model(), data, repeats=1)
+
+
 def test_a_mask_of_another_aspect_is_refused(tmp_path, images):
     tiny.write_colmap(tmp_path, images)
     path = tmp_path / "masks" / "view03.png"

@@ -165,6 +165,13 @@ class Photograph(Shot):
             with opened(self.mask) as file:
                 _expect_aspect(self.mask, file.size, "its photograph", whole)
                 seen = self._fitted(file.convert("L"), size) >= _SEEN
+            if not seen.any():
+                raise DatasetError(
+                    str(self.mask),
+                    "a mask that is black everywhere",
+                    "some of the photograph to look at",
+                    "Remove the view, or turn the mask over.",
+                )
             shown = seen[..., None].astype(np.uint8)
             flat = np.concatenate([flat * shown, shown], axis=2)
         return torch.from_numpy(flat)
