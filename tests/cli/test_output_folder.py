@@ -107,6 +107,26 @@ def test_a_training_that_held_nothing_out_is_warned_of(tmp_path, caplog):
     assert "trained without --eval" in caplog.text
 
 
+@pytest.mark.parametrize("held", [True, False])
+def test_views_that_a_training_saw_are_not_said_to_be_held_out(tmp_path, held):
+    data, _, model = tiny.scene(tmp_path)
+    output, out = write_output(tmp_path / "out", data, model, eval=held), tmp_path / "r/pruned.ply"
+    words = ("--data", data, "--out", out, "--iters", 3, "--train", "opacity")
+    said = "on 2 views that were held out." if held else "on 2 views that its training had seen."
+    assert said in run("finetune", output, *words).stdout
+    assert said in run_json("report", out.parent, "--data", data)["result"]
+    page = (out.parent / "report.html").read_text()
+    assert ("nothing learned from it" in page) is held
+    assert run_json("finetune", output, *words)["seen"] is not held
+
+
+def test_beside_data_and_a_white_background_it_is_warned_of_too(tmp_path, caplog):
+    data, _, model = tiny.scene(tmp_path)
+    output = write_output(tmp_path / "out", data, model, eval=False)
+    assert run("profile", output, "--data", data, "--white-background").exit_code == 0
+    assert "trained without --eval" in caplog.text
+
+
 SIZES = {
     -1: Resolution(width=1600, shrink_only=True),
     1: Resolution(divide=1),

@@ -172,6 +172,18 @@ def test_a_control_lies_beside_the_result_and_is_quoted_with_it(folder):
     assert "pruning itself makes" in run_json("report", out)["result"]
 
 
+@pytest.mark.parametrize("held", [True, False])
+def test_views_that_stage_one_saw_are_not_said_to_be_held_out(scene, tmp_path, held):
+    out = tmp_path / "out"
+    words = command(scene, out, "--densify_until_iter", 8)
+    first = [word for word in words if held or word != "--eval"]
+    ran("--stage", "off", *WORDS, *first)
+    line = run("run", "--stage", "finetune", *WORDS, *words).stdout
+    assert ("that were held out" in line) == held
+    assert ("that its training had seen" in line) != held
+    assert ("that were held out" in run_json("report", out)["result"]) == held
+
+
 def test_a_finished_stage_two_says_so_and_runs_nothing(folder):
     out, scene = folder
     finetune, words = ["--stage", "finetune", *WORDS], command(scene, out, "-r", 2)

@@ -269,6 +269,7 @@ def write_page(
         title="The same picture from fewer fragments",
         facts=headlines(report, report["control"]),
         quote=outcome("run", report, report["control"]),
+        seen=False,
         notes=begun(report),
         table=report_page.figures(
             {"original": report["before"], "control": report["control"], "pruned": report["after"]}

@@ -149,11 +149,13 @@ def outcome(command: str, data: dict[str, Any], control: dict[str, Any] | None) 
 
     Args:
         command: "run" or "finetune".
-        data: its figures, including "before", "after" and "settings".
+        data: its figures, including "before", "after" and "settings"; and "seen", which records may
+            lack: whether the training before it held nothing out.
         control: what as many iterations without truncation gave; None if not run.
     """
     before, after = data["before"], data["after"]
-    gained = f"{gain(before, after)} that were held out"
+    held = "that its training had seen" if data.get("seen") else "that were held out"
+    gained = f"{gain(before, after)} {held}"
     if data["settings"]["goal"] == CONTROL:
         said = f"{gained}{IS_CONTROL}"
     elif after.get("target") == ITSELF:

@@ -24,6 +24,7 @@ from fragprune_plugins.workbench.models import formats
 from fragprune_plugins.workbench.models.model import describe_written
 from fragprune_plugins.workbench.pruning import Keep
 from fragprune_plugins.workbench.scenes.dataset import Dataset
+from fragprune_plugins.workbench.scenes.output import saw_all
 
 LOST = 0.05
 """A loss of PSNR against the model as it came, in dB, from which on more is advised."""
@@ -128,6 +129,7 @@ class Finetuned:
             "after": after,
             "untruncated": without[0] if without else None,
             "self": asked.itself,
+            "seen": not asked.itself and saw_all(asked.model),
             "keep": asked.keep,
             "forgotten": self.forgotten,
             "speedup": done.speedup,

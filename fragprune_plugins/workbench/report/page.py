@@ -89,8 +89,9 @@ def compose(
         drawn: the views that ``draw_views`` drew; None where there are none.
         source: turns a picture's file name into its ``src``, a relative path or a data URL.
         labels: what people read for the two models.
-        values: title; facts, (number, words) of each; quote, a sentence; notes; table; plots,
-            (heading, file) of each; others, with heading, sentence and table; settings, a table.
+        values: title; facts, (number, words) of each; quote, a sentence; seen, whether the training
+            saw the views; notes; table; plots, (heading, file) of each; others, with heading,
+            sentence and table; settings, a table.
     """
     shown = vars(drawn or Drawn((), "", 1.0, 1.0))
     values |= shown | {"source": source, "names": NAMES, "labels": labels}

@@ -73,6 +73,7 @@ def report(*, folder: Path, out: Path | None, data: Path | None, engine: EngineO
             title=f"{_heading(main)} of {_of(main, folder)}",
             facts=_facts(main, files),
             quote=line,
+            seen=bool(main.data.get("seen")),
             labels=("original", "control") if control else report_page.NAMES,
             notes=records.portable(notes, folder),
             table=_table(main),

@@ -37,6 +37,7 @@ from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.pruning import kept
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
 from fragprune_plugins.workbench.scenes.generated import views_near
+from fragprune_plugins.workbench.scenes.output import saw_all
 
 log = logging.getLogger("fragprune")
 
@@ -90,7 +91,7 @@ def run(
                     before = first[0] if first else None
             except FragpruneError as error:  # the trained model is saved already
                 not_compared = error
-    data = _figures(summary, settings, looking.trial, before, after, not_compared)
+    data = _figures(summary, settings, looking, before, after, not_compared)
     if summary.steps and summary.model_after:
         read = photographs and photographs.as_dict()
         more = {"curves": summary.curves, "photographs": read}
@@ -115,12 +116,13 @@ def _enough_memory() -> Iterator[None]:
 def _figures(
     summary: launch.RunSummary,
     settings: Settings,
-    trial: Trial | None,
+    looking: Looking,
     before: dict[str, Any] | None,
     after: dict[str, Any] | None,
     not_compared: FragpruneError | None,
 ) -> dict[str, Any]:
     """What --json prints."""
+    trial = looking.trial
     data: dict[str, Any] = {
         "adapter": summary.adapter,
         "engine": summary.engine,
@@ -137,6 +139,7 @@ def _figures(
         "not_compared": not_compared and not_compared.as_dict(),
         "model_before": _text(summary.model_before),
         "model_after": _text(summary.model_after),
+        "seen": looking.seen,
         "keep": trial and trial.keep,
         "forgotten": trial and trial.forgotten,
         "pressure": summary.curves[-1]["pressure"] if summary.curves else None,
@@ -237,15 +240,21 @@ def _viewable(model: Path) -> bool:
 
 @dataclass
 class Looking:
-    """What ``RunOptions.look`` calls; ``trial`` is None where nothing could be tried."""
+    """What ``RunOptions.look`` calls; ``trial`` is None where nothing could be tried.
+
+    Attributes:
+        seen: the training of stage 1, of an earlier command, held no view out.
+    """
 
     engine: EngineOptions
     trial: Trial | None = None
+    seen: bool = False
 
     def __call__(
         self, ply: Path, photographs: Photographs, drawing: Mapping[str, Any], settings: Settings
     ) -> tuple[Settings, Tensor | None]:
         """Make the trial of ``fragprune finetune``, and score the Gaussians as it does."""
+        self.seen = saw_all(ply)  # stage 2 writes its own arguments over those of stage 1
         try:
             with _enough_memory():
                 return self._look(ply, photographs, drawing, settings)

@@ -72,6 +72,28 @@ def trained_on(model: Path) -> Photographs | None:
     Raises:
         DatasetError: the arguments cannot be read.
     """
+    if (known := _arguments(model)) is None:
+        return None
+    photographs, held_out = known
+    if not held_out:
+        log.warning(
+            "%s was trained without --eval: it has seen the held-out views, so figures on them "
+            "flatter it",
+            printable(str(output_folder(model))),
+        )
+    return photographs
+
+
+def saw_all(model: Path) -> bool:
+    """Whether the training of a model, by the arguments in its output folder, held no view out."""
+    with contextlib.suppress(DatasetError):
+        known = _arguments(model)
+        return known is not None and not known[1]
+    return False
+
+
+def _arguments(model: Path) -> tuple[Photographs, bool] | None:
+    """The photographs of a model's training, and whether it held views out; None if not known."""
     folder = output_folder(model)
     if folder is None or not (folder / ARGUMENTS).exists():
         return None
@@ -89,13 +111,7 @@ def trained_on(model: Path) -> Photographs | None:
             bool(values.get("white_background", False)),
             str(values.get("images", "images")),
         )
-    if not values.get("eval", False):
-        log.warning(
-            "%s was trained without --eval: it has seen the held-out views, so figures on them "
-            "flatter it",
-            printable(str(folder)),
-        )
-    return photographs
+    return photographs, bool(values.get("eval", False))
 
 
 def over_white(model: Path) -> bool:
