@@ -56,6 +56,15 @@ def test_nerfstudios_file_goes_before_its_colmap_model(tmp_path, images):
     assert stems(load_dataset(tmp_path).train) == NAMES[1:8]  # colmap/sparse/0 with images/
 
 
+@pytest.mark.parametrize("named", [True, False])
+def test_nerfstudio_s_own_choice_of_held_out_views_is_warned_of(tmp_path, images, named, caplog):
+    """A tenth of the frames, evenly: most of ours, every eighth, it has trained on."""
+    some = {"test_filenames": ["images/view03.png"]} if named else {}
+    write_nerfstudio(tmp_path, images, **some)
+    load_dataset(tmp_path)
+    assert ("train with --eval-mode interval" in caplog.text) is not named
+
+
 def test_a_smaller_image_folder_serves_and_is_named(tmp_path, images, caplog):
     tiny.write_colmap(tmp_path, images)
     (tmp_path / "images").rename(tmp_path / "images_4")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,8 @@ SINGLE = "transforms.json"
 _PINHOLES = ("", "PINHOLE", "SIMPLE_PINHOLE")
 _BENT = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE")
 _FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+
+log = logging.getLogger("fragprune")
 
 JSON_MAX = 32 * MEBIBYTE
 """Ten thousand frames of nerfstudio take 11 to 13 MiB, of a ``cameras.json`` 4."""
@@ -67,7 +70,14 @@ def read(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]
         files = [_listed(frame["file_path"]) for frame in content["frames"]]
     named = [(row, file) for row, file in zip(rows, files, strict=True)]
     wanted = [row for row, file in named if file not in held and (not kept or file in kept)]
-    return (wanted, [row for row, file in named if file in held]) if held else split(wanted)
+    if held:
+        return wanted, [row for row, file in named if file in held]
+    log.warning(
+        "nerfstudio itself holds out other views of a transforms.json that names none: for a model "
+        "of it, train with --eval-mode interval; until then figures on held-out views include "
+        "views that it was trained on"
+    )
+    return split(wanted)
 
 
 def read_transforms(path: Path, images: str = "images") -> list[Posed]:
