@@ -46,8 +46,8 @@ class Progress:
     Attributes:
         steps: that learned: the driver's optimizer took them.
         gaussians: N.
-        fragments_before: per pixel, mean over views: untruncated, with the opacities at each view's
-            first visit; None where no view was drawn.
+        fragments_before: per pixel, mean over the views that were drawn since thresholds opened,
+            over all before: untruncated, as at each one's first visit; None where none was drawn.
         fragments_after: likewise, as drawn at each view's last visit.
         speedup: before over after; where a target was met, as measured when it was met.
         faster: frame times before over after, as measured when a target time was met; else None.

@@ -357,9 +357,9 @@ class Stage2:
 
     def progress(self) -> Progress:
         """The state so far."""
-        before, after = _mean(self._before), _mean(self._after)
+        before = _mean({p: self._before[p] for p in self._after or self._before})
+        after, reached, target = _mean(self._after), None, self.target
         figures = {"speedup": before / after if before is not None and after else None}
-        reached, target = None, self.target
         if target is not None:
             figures |= {} if target.met is None else {target.figure: target.met}
             ratio = figures.get(target.figure)

@@ -130,6 +130,16 @@ def test_a_warm_up_draws_without_thresholds_and_counts_what_came_in():
     assert told[1].fragments_per_pixel < 20.0
 
 
+def test_fragments_before_and_after_are_of_the_same_views():
+    it = stage(settings=Settings(iterations=2001, train="all", goal=Pressure(1e-2)))
+    it.begin(lambda: OPACITIES)
+    it.on_drawn("rich", drawing(None, 90.0), lambda: drawing(None, 90.0))
+    it.end()
+    assert it.progress().fragments_before == 90.0
+    step(it, "a")
+    assert it.progress().fragments_before == 20.0
+
+
 def test_rates_follow_the_schedule():
     it = stage(schedule=Turns(Settings(iterations=10)))
     assert it.rate("f_dc", 0.4) == 0.4
