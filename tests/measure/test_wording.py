@@ -158,6 +158,18 @@ def test_against_itself_there_is_no_figure_before_and_no_control(infinite, psnr,
     assert first.split() == ["PSNR", "to", "itself,", "dB", "equal", f"{psnr:.2f}"]
 
 
+@pytest.mark.parametrize("infinite", [float("inf"), None])
+def test_pictures_that_are_equal_have_no_decibels(infinite):
+    rows = {"ssim": 1.0, "area_per_pixel": 40.0, "gaussians": 9, "engine": "cpu", "device": "cpu"}
+    each = measured(39.1, 2.33, infinite) | rows | ITSELF
+    figures = data() | {"before": each, "after": dict(each)}
+    assert "(no difference beyond the noise), equal pictures on 7 views" in gain(each, dict(each))
+    assert "Warning" not in outcome("finetune", figures, None)
+    assert headlines(figures, None)[2][0] == "equal"
+    first, *_ = describe({"A": each, "B": dict(each)}).splitlines()[1:]
+    assert first.split() == ["PSNR", "to", "itself,", "dB", "equal", "equal"]
+
+
 @pytest.mark.parametrize(
     ("before", "after", "change", "frame"),
     [

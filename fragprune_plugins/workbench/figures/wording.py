@@ -87,7 +87,7 @@ def tabulate(columns: Mapping[str, dict[str, Any]]) -> list[list[str]]:
         if key == "lpips" and any(each.get(key) is None for each in reports):
             continue  # an installation may lack it
         if key == "psnr" and itself:  # before, it is infinite: null in a record
-            equal = ["equal" if each is reports[0] else f"{each[key]:.2f}" for each in reports]
+            equal = ["equal" if _same(each) else f"{each[key]:.2f}" for each in reports]
             rows.append(["PSNR to itself, dB", *equal, *([""] if change else [])])
             continue
         cells = [f"{report[key]:.{digits}f}" for report in reports]
@@ -140,8 +140,13 @@ def gain(before: dict[str, Any], after: dict[str, Any], enlarge: int = 1) -> str
 def _quality(before: dict[str, Any], after: dict[str, Any]) -> str:
     """A phrase for what became of the picture."""
     if after.get("target") == ITSELF:
-        return f"{after['psnr']:.2f} dB PSNR against itself"
+        return "equal pictures" if _same(after) else f"{after['psnr']:.2f} dB PSNR against itself"
     return f"{after['psnr'] - before['psnr']:+.2f} dB PSNR"
+
+
+def _same(report: dict[str, Any]) -> bool:
+    """Whether pictures equalled their targets: PSNR is infinite, or None in a record."""
+    return report["psnr"] is None or math.isinf(report["psnr"])
 
 
 def outcome(command: str, data: dict[str, Any], control: dict[str, Any] | None) -> str:
@@ -204,7 +209,8 @@ def headlines(data: Mapping[str, Any], control: dict[str, Any] | None) -> list[t
     else:  # no ratio: a busy machine tells none
         frame = f"{slow:.1f} → {fast:.1f} ms", f"for frames{of}: no difference beyond the noise"
     if after.get("target") == ITSELF:
-        picture = f"{after['psnr']:.1f} dB", "PSNR of the picture against the original's own"
+        figure = "equal" if _same(after) else f"{after['psnr']:.1f} dB"
+        picture = figure, "PSNR of the picture against the original's own"
     elif control is not None:
         gained = _by_pruning(before, after, control)
         picture = f"{gained:+.2f} dB", "PSNR against the same training without pruning"
@@ -302,7 +308,7 @@ def missed(data: Mapping[str, Any]) -> str:
 def _fell(before: dict[str, Any], after: dict[str, Any], control: dict[str, Any] | None) -> str:
     """A warning where much PSNR was lost; else nothing."""
     if after.get("target") == ITSELF:
-        shows = after["psnr"] < VISIBLE
+        shows = not _same(after) and after["psnr"] < VISIBLE
         return f" Warning: below {VISIBLE:g} dB the change can be seen." if shows else ""
     loss = (control or before)["psnr"] - after["psnr"]
     if loss <= FELL:
