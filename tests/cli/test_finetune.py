@@ -106,6 +106,14 @@ def test_a_model_that_other_viewers_draw_badly_says_what_to_do(drop, advised):
     assert ("--portable" in line) == advised
 
 
+@pytest.mark.parametrize(("psnr", "advised"), [(48.3, False), (34.0, True)])
+def test_against_itself_the_change_has_to_be_seen(psnr, advised):
+    """The original's own PSNR is infinite: anything is far below."""
+    plain = {"psnr": psnr, "target": "itself", "fragments_per_pixel": 9.0, "frame_ms": 1.0}
+    line = describe_untruncated({"psnr": math.inf}, plain | {"frame_ms_se": 0.1})
+    assert ("--portable" in line) == advised
+
+
 @pytest.mark.parametrize(
     ("drop", "more", "advised"),
     [

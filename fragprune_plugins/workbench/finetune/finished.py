@@ -256,9 +256,8 @@ def describe_untruncated(before: dict[str, Any], plain: dict[str, Any]) -> str:
     """A line on the fine-tuned model without its cutoffs."""
     own = plain["target"] == "itself"
     compared = "against itself" if own else f"({plain['psnr'] - before['psnr']:+.2f})"
-    advice = ""
-    if before["psnr"] is not None and plain["psnr"] < before["psnr"] - wording.FELL:
-        advice = " For such viewers: --portable."
+    least = wording.VISIBLE if own else before["psnr"] - wording.FELL
+    advice = " For such viewers: --portable." if plain["psnr"] < least else ""
     return (
         f"In viewers that know no cutoffs: {plain['psnr']:.2f} dB PSNR "
         f"{compared}, {plain['fragments_per_pixel']:.1f} fragments "
