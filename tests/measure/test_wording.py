@@ -134,6 +134,11 @@ def test_a_picture_that_is_worse_by_half_a_decibel_is_warned_of(after, control, 
     assert ("Warning" in line) == bool(warning)
 
 
+def test_one_view_is_no_views():
+    figures = data() | {"after": AFTER | {"views": 1}}
+    assert "dB PSNR on 1 view that was held out." in outcome("finetune", figures, None)
+
+
 def test_a_control_says_that_it_is_one():
     line = outcome("finetune", data("control"), None)
     assert "a control, nothing is truncated" in line

@@ -74,7 +74,7 @@ def measured_with(columns: Mapping[str, dict[str, Any]]) -> str:
     """What the last measurement was made with: views, engine, device."""
     report = list(columns.values())[-1]
     made = f"{report['engine']} engine on {report['device']}"
-    return f"Means over {report['views']} views, ± a standard error; {made}"
+    return f"Means over {_views(report)}, ± a standard error; {made}"
 
 
 def tabulate(columns: Mapping[str, dict[str, Any]]) -> list[list[str]]:
@@ -133,8 +133,13 @@ def gain(before: dict[str, Any], after: dict[str, Any], enlarge: int = 1) -> str
     """
     return (
         f"{fewer(before['fragments_per_pixel'], after['fragments_per_pixel'])}, "
-        f"{frames(before, after, enlarge)}, {_quality(before, after)} on {after['views']} views"
+        f"{frames(before, after, enlarge)}, {_quality(before, after)} on {_views(after)}"
     )
+
+
+def _views(report: dict[str, Any]) -> str:
+    """How many views a measurement is of."""
+    return f"{report['views']} view" + ("" if report["views"] == 1 else "s")
 
 
 def _quality(before: dict[str, Any], after: dict[str, Any]) -> str:
@@ -159,7 +164,8 @@ def outcome(command: str, data: dict[str, Any], control: dict[str, Any] | None) 
         control: what as many iterations without truncation gave; None if not run.
     """
     before, after = data["before"], data["after"]
-    held = "that its training had seen" if data.get("seen") else "that were held out"
+    held = f"that {'was' if after['views'] == 1 else 'were'} held out"
+    held = "that its training had seen" if data.get("seen") else held
     gained = f"{gain(before, after)} {held}"
     if data["settings"]["goal"] == CONTROL:
         said = f"{gained}{IS_CONTROL}"
