@@ -3,6 +3,7 @@
 import json
 import logging
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -282,11 +283,20 @@ def test_a_photograph_that_would_be_cut_to_8_bits_is_refused(tmp_path, images, k
 
 @pytest.mark.parametrize(
     ("names", "warned"),
-    [(["a.jpg", "b.jpg"], False), (["a.jpg", "a-1.jpg"], True), (["x/b.jpg", "y/a.jpg"], True)],
+    [
+        (["a.jpg", "b.jpg"], False),
+        (["a.jpg", "a-1.jpg"], True),
+        (["x/b.jpg", "y/a.jpg"], True),
+        (["a.1.jpg", "a.2.jpg"], False),
+        (["a.2.jpg", "a.1.jpg"], True),
+    ],
 )
 def test_hosts_that_hold_out_other_views_are_warned_of(names, warned, caplog):
-    """By stems a comes before a-1, and by whole names after it."""
+    """By stems a comes before a-1, and by whole names after it.
+
+    To hosts both of a.2 and a.1 are a, and stay in the order in which COLMAP lists them.
+    """
     rows = [Posed(name, tiny.cameras()[0], Path(name)) for name in names]
     _, (held,) = split(rows)
     assert held.name == min(names, key=lambda name: Path(name).stem)
-    assert ("holds out other views" in caplog.text) == warned
+    assert bool(re.search("holds? out other views", caplog.text)) == warned

@@ -44,8 +44,8 @@ def hold_out(items: Sequence[Item]) -> tuple[list[Item], list[Item]]:
 def split(rows: list[Posed]) -> tuple[list[Posed], list[Posed]]:
     """The training views and the held-out views of a scene that does not say which they are.
 
-    Hosts sort by names without their suffix and folder, 3DGS since October 2024 by whole names. It
-    is warned of where that holds out other views.
+    Hosts sort by names without their suffix and folder, which they end at the first dot; 3DGS since
+    October 2024 by whole names. It is warned of where that holds out other views.
     """
     train, test = hold_out(sorted(rows, key=lambda row: Path(row.name).stem))
     whole = sorted(row.name for row in rows)[::HOLD_OUT]
@@ -54,5 +54,13 @@ def split(rows: list[Posed]) -> tuple[list[Posed], list[Posed]]:
             "3DGS since October 2024 holds out other views of this scene: it sorts whole names. "
             "For a model of it, rename the images so that both orders agree, and train again; "
             "until then figures on held-out views include views that it was trained on"
+        )
+    _, dotted = hold_out(sorted(rows, key=lambda row: Path(row.name).name.partition(".")[0]))
+    if {row.name for row in dotted} != {row.name for row in test}:
+        log.warning(
+            "3DGS before October 2024 and most hosts hold out other views of this scene: to them a "
+            "name ends at its first dot. For a model of them, name the images without other dots, "
+            "and train again; until then figures on held-out views include views that it was "
+            "trained on"
         )
     return train, test
