@@ -10,6 +10,7 @@ import ast
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from weakref import WeakKeyDictionary
 
@@ -339,6 +340,7 @@ def _training(repo: HostRepo) -> list[str]:
     return named or [*map(reading.module_of, reading.training_scripts(repo))]
 
 
+@lru_cache(maxsize=16)
 def _scripts(repo: HostRepo) -> dict[Path, str]:
     """The files of a codebase that may draw or save its model, with their text."""
     paths = [path for each in ("", "*/", "*/*/") for path in sorted(repo.root.glob(f"{each}*.py"))]

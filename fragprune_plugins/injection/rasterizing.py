@@ -34,7 +34,8 @@ from fragprune_plugins.types import RasterInputs, RasterOutputs
 log = logging.getLogger("fragprune")
 
 
-SCALER = Seam(Role.LOSS, "torch.amp.grad_scaler", "GradScaler.scale", ("outputs",), external=True)
+_AMP = "torch.amp" if hasattr(torch.amp, "GradScaler") else "torch.cuda.amp"  # before torch 2.3
+SCALER = Seam(Role.LOSS, f"{_AMP}.grad_scaler", "GradScaler.scale", ("outputs",), external=True)
 
 
 class _AddToLoss(torch.autograd.Function):

@@ -1,5 +1,6 @@
 """A session, from its activation to its summary, over the smallest host."""
 
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,7 +12,7 @@ from fragprune_plugins import Control, Portable, Pressure, Settings
 from fragprune_plugins.errors import RanksError, SessionError, UsageError
 from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
 from fragprune_plugins.injection import ranks
-from fragprune_plugins.injection.rasterizing import on_metric
+from fragprune_plugins.injection.rasterizing import SCALER, on_metric
 from fragprune_plugins.injection.session import active_session
 
 
@@ -141,6 +142,10 @@ def test_a_metric_without_its_weights_is_nan_be_it_a_function_or_a_class(error, 
             assert number.isnan()
     assert len(caplog.messages) == 2
     assert all("it is NaN" in said and "\n" not in said for said in caplog.messages)
+
+
+def test_what_scales_a_loss_is_wrapped_where_this_torch_has_it():
+    assert import_module(SCALER.module).GradScaler.scale
 
 
 @pytest.mark.skipif(torch.__version__ < "2.3", reason="torch scales no gradient on a CPU")
