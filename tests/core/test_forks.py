@@ -202,6 +202,8 @@ def test_blended_channels_are_known_by_argument_and_kernel(tmp_path, name):
     assert errors(fork(tmp_path / "alone", features, **alone, kernel=OBJECTS)) == []
     two = f"{OBJECTS} out_depth[pix_id] = D;"
     assert errors(fork(tmp_path / "two", features, **alone, kernel=two))
+    more = alone | {"values": "image, radii, features, touched"}
+    assert errors(fork(tmp_path / "more", features, **more, kernel=OBJECTS))
     lit = OBJECTS.replace("= O[ch]", "= O[ch] + T * bg[ch]")
     assert errors(fork(tmp_path / "lit", used, **given, kernel=lit))
     made = "    objects = pc.get_objects if pipe.seen else torch.zeros((1,))\n    rasterizer ="
@@ -1033,8 +1035,10 @@ def test_flags_are_written_out_as_argparse_completes_them(tmp_path, words):
     given = f"import beside{MORE_FLAGS}parser.add_argument('--iterations')\n"
     given += "parser.add_argument('--sparse')"
     fork(tmp_path, ("\ndef read_flags", f"\n{given}\n\ndef read_flags"))
-    in_full = partial(ForkAdapter().command_line(HostRepo(tmp_path)).in_full, tmp_path / "train.py")
+    line = ForkAdapter().command_line(HostRepo(tmp_path))
+    in_full = partial(line.in_full, tmp_path / "train.py")
     assert in_full([*words]) == BEGINNINGS[words]
+    assert line.read(["--model", "gs"]).output is None
     with pytest.raises(UsageError, match="--sparse, --start_checkpoint"):
         in_full(["--s"])
 
