@@ -25,12 +25,6 @@ def test_learned_thresholds_come_back_to_the_bit(model, tmp_path):
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
-def test_a_model_without_thresholds_replaces_one_with_them(model, tmp_path):
-    fp.save(tmp_path / "a.ply", model)
-    fp.save(tmp_path / "a.ply", model.untruncated())
-    assert fp.load(tmp_path / "a.ply").thresholds is None
-
-
 def test_a_pair_is_read_and_replaced_by_one_file(model, tmp_path):
     path = tmp_path / "a.ply"
     write_ply(path, model.untruncated())

@@ -34,36 +34,26 @@ def test_a_dataclass_with_tensors_is_shown_short(kind):
     assert kind.__repr__ is one_line
 
 
-@pytest.fixture(scope="module")
-def values():
-    splat = tiny.random_model(count=500)
+def test_one_line_with_shapes_types_and_counts_and_without_the_numbers_of_tensors():
+    splat, store = tiny.random_model(count=500), fp.ThresholdStore(500)
     inputs = fp.RasterInputs(tiny.cameras()[0].view(), splat.splats())
     outputs = fp.rasterize(replace(inputs, counts=True))
-    store = fp.ThresholdStore(500)
-    model = replace(splat, thresholds=store)
-    return [inputs.view, inputs.splats, inputs, outputs, splat, store, model]
-
-
-def test_one_line_without_the_numbers_of_tensors(values):
-    for value in values:
+    for value in (inputs.view, inputs.splats, inputs, outputs):
         text = repr(value)
         assert text.startswith(type(value).__name__ + "(")
         assert "\n" not in text
         assert "tensor(" not in text
         assert len(text) < 800
-
-
-def test_shapes_types_and_counts_are_shown(values):
-    view, splats, *_, splat, store, model = values
     assert repr(store) == "ThresholdStore(logits=float32[500], steps=0)"
     assert repr(splat) == (
         "Model(xyz=float32[500, 3], f_dc=float32[500, 1, 3], f_rest=float32[500, 3, 3], "
         "opacity=float32[500, 1], scaling=float32[500, 3], rotation=float32[500, 4])"
     )
+    model = replace(splat, thresholds=store)
     assert repr(model) == f"{repr(splat)[:-1]}, thresholds={store!r})"
-    assert repr(view).startswith("View(width=32, height=32, tan_fov_x=0.44")
-    assert "sh_degree=1" in repr(splats)
-    assert "cov3d" not in repr(splats)  # what is not given is not shown
+    assert repr(inputs.view).startswith("View(width=32, height=32, tan_fov_x=0.44")
+    assert "sh_degree=1" in repr(inputs.splats)
+    assert "cov3d" not in repr(inputs.splats)  # what is not given is not shown
 
 
 def test_another_device_is_named():

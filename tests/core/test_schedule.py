@@ -151,6 +151,9 @@ def test_settings_choose_their_pressure():
     assert Settings(goal=Control()).make_pressure() == PressureRule(0.0)
 
 
+GIVEN = Settings(5000, dropout=0.2, goal=Pressure(3e-5))
+
+
 @pytest.mark.parametrize(
     ("settings", "least"),
     [
@@ -159,27 +162,15 @@ def test_settings_choose_their_pressure():
         (Settings(5000, dropout=0.0), LEAST_PRESSURE),
         (Settings(5000), LEAST_PRESSURE),
         (Settings(5000, dropout=0.2, train="opacity"), LEAST_PRESSURE),
+        (JointSchedule(Settings(5000, dropout=0.2), 1), LEAST_PRESSURE),
+        (GIVEN, 3e-5),
     ],
 )
-def test_a_warm_up_with_dropout_bears_more_pressure(settings, least):
+def test_a_warm_up_with_dropout_bears_more_pressure_unless_it_is_given(settings, least):
     pressure = settings.make_pressure()
     assert pressure.value == least
     pressure.observe(Observation(0.5, fragments=40.0, ratio=1.0, loss=1e-9))
     assert pressure.value == least
-
-
-def test_dropout_changes_no_pressure_that_is_given_nor_that_of_a_training():
-    given = Settings(5000, dropout=0.2, goal=Pressure(1e-4)).make_pressure()
-    assert given == PressureRule(1e-4)
-    joint = JointSchedule(Settings(5000, dropout=0.2), 1).make_pressure()
-    assert joint.value == LEAST_PRESSURE
-
-
-def test_a_fixed_pressure_stays():
-    pressure = PressureRule(2e-4)
-    for step in range(10):
-        pressure.observe(Observation(step / 10, fragments=10, ratio=2.0, loss=0.5))
-    assert pressure.value == 2e-4
 
 
 def observed(losses, fragments):
