@@ -1,22 +1,17 @@
 """One line in a fork, in a process of its own."""
 
-from pathlib import Path
-
 import pytest
+from miniatures.runs import written
 
-from fragprune_plugins.workbench import demo
-
-HOST = Path(demo.__file__).with_name("host")
+from fragprune_plugins.testing import Host
 
 
 @pytest.fixture
 def fork(tmp_path):
     """The demo's host as somebody's fork of it, rewritten for the CPU."""
-    root = tmp_path / "fork"
-    for path in HOST.rglob("*.py"):
-        target = root / path.relative_to(HOST)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_text(path.read_text().replace('"cuda"', '"cpu"').replace(".cuda()", ""))
+    root = written(Host, tmp_path / "fork")
+    for path in root.rglob("*.py"):
+        path.write_text(path.read_text().replace('"cuda"', '"cpu"').replace(".cuda()", ""))
     return root
 
 

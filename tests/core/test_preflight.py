@@ -12,12 +12,12 @@ from fragprune_plugins.plugins.loading import load_plugins
 ADAPTERS = load_plugins().adapters
 
 
-def missing(tmp_path, files, provided=()):
+def missing(tmp_path, files, provided=(), script="train.py", package=""):
     for name, text in files.items():
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
-    found = missing_imports(HostRepo(tmp_path), [tmp_path / "train.py"], provided)
+    found = missing_imports(HostRepo(tmp_path, package), [tmp_path / script], provided)
     return [(each.module, each.at) for each in found]
 
 
@@ -90,21 +90,16 @@ def test_what_the_checkout_holds_somewhere_is_the_hosts_to_find(tmp_path):
 
 
 def test_scripts_in_a_folder_of_the_checkout_find_its_modules(tmp_path):
-    (tmp_path / "ms").mkdir()
-    (tmp_path / "ms" / "train.py").write_text("import shared")
-    (tmp_path / "shared.py").write_text("import absent_shared")
-    (found,) = missing_imports(HostRepo(tmp_path), [tmp_path / "ms" / "train.py"], ())
-    assert found == Missing("absent_shared", "shared.py:1")
+    files = {"ms/train.py": "import shared", "shared.py": "import absent_shared"}
+    found = missing(tmp_path, files, script="ms/train.py")
+    assert found == [("absent_shared", "shared.py:1")]
 
 
 def test_an_installed_host_is_followed_and_its_neighbours_are_not(tmp_path):
-    for name in ("toyhost", "neighbour"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "__init__.py").write_text(f"import absent_{name}")
-    script = tmp_path / "toyhost" / "train.py"
-    script.write_text("import neighbour\nfrom toyhost import model")
-    found = missing_imports(HostRepo(tmp_path, "toyhost"), [script], ())
-    assert {each.module for each in found} == {"neighbour", "absent_toyhost"}
+    files = {f"{name}/__init__.py": f"import absent_{name}" for name in ("toyhost", "neighbour")}
+    files["toyhost/train.py"] = "import neighbour\nfrom toyhost import model"
+    found = missing(tmp_path, files, script="toyhost/train.py", package="toyhost")
+    assert {module for module, _ in found} == {"neighbour", "absent_toyhost"}
 
 
 def test_pip_is_told_its_own_names():
@@ -125,10 +120,7 @@ def test_the_names_that_an_adapter_says_it_answers_are_those_it_makes(adapter):
 
 def test_a_script_beside_the_package_it_uses_has_modules_of_its_own(tmp_path):
     """As in a checkout that is installed in place: its examples are no part of the package."""
-    for name in ("library/__init__.py", "examples/helper.py"):
-        (tmp_path / name).parent.mkdir()
-        (tmp_path / name).write_text("")
-    script = tmp_path / "examples" / "train.py"
-    script.write_text("import helper, library, not_here_at_all\n")
-    (missing,) = missing_imports(HostRepo(tmp_path, "library"), [script], ())
-    assert missing.module == "not_here_at_all"
+    files = {"library/__init__.py": "", "examples/helper.py": ""}
+    files["examples/train.py"] = "import helper, library, not_here_at_all"
+    ((module, _),) = missing(tmp_path, files, script="examples/train.py", package="library")
+    assert module == "not_here_at_all"

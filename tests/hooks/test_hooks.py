@@ -1,6 +1,7 @@
 """One test a hook: what a plugin answers has its effect; what it is told is true."""
 
 import re
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -146,8 +147,6 @@ def test_hook_fragprune_create_engine():
 def test_hook_fragprune_create_schedule():
     class Late(Schedule):
         def at(self, step):
-            from dataclasses import replace
-
             return replace(super().at(step), learn=step > 2)
 
     class Plugin:

@@ -1,7 +1,6 @@
 """Hosts with worker processes, a compiled render function, or several ranks."""
 
 import json
-import os
 import sys
 from pathlib import Path
 
@@ -9,9 +8,11 @@ import pytest
 import torch
 from finetune import several
 from miniatures.runs import OPTIONS, command, edit, written
+from miniatures.vanilla_3dgs import joint
 
 from fragprune_plugins.errors import RanksError
 from fragprune_plugins.files import sidecar
+from fragprune_plugins.injection import ranks
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.testing import Host
 from fragprune_plugins.testing.fresh import fresh
@@ -110,19 +111,6 @@ def test_a_compiled_render_function_learns_the_same_bits(photographs, tmp_path):
     assert results[1][2] == []
 
 
-def test_under_torchrun_learning_is_refused_before_the_host_runs(
-    photographs, tmp_path, monkeypatch
-):
-    monkeypatch.setenv("WORLD_SIZE", "2")
-    script = written(Host, tmp_path / "host") / "train.py"
-    script.write_text(f"raise SystemExit('it ran')\n{script.read_text()}")
-    words = command(script, photographs, tmp_path / "out", 12)
-    with pytest.raises(RanksError) as caught:
-        run(words, RunOptions(device="cpu"))
-    assert caught.value.found == "WORLD_SIZE=2 in the environment"
-    assert "--stage finetune without torchrun" in caught.value.remedy
-
-
 def test_under_torchrun_run_says_once_why_it_learns_in_one_process(photographs, tmp_path):
     script = written(Host, tmp_path / "host") / "train.py"
     words = command(script, photographs, tmp_path / "out", 12)
@@ -131,6 +119,7 @@ def test_under_torchrun_run_says_once_why_it_learns_in_one_process(photographs, 
     assert [code for code, _, _ in left] == [1, 1]
     said = "".join(out + err for _, out, err in left)
     assert said.count("[ranks]") == 1
+    assert "WORLD_SIZE=2 in the environment" in said
     assert "torchrun -m fragprune_plugins finetune" in said
     assert not (tmp_path / "out").exists()
 
@@ -145,39 +134,15 @@ def test_a_command_that_starts_several_processes_is_refused(launcher):
         run([*launcher.split(), "train.py", "-s", "scene"], RunOptions(device="cpu"))
 
 
+def test_a_host_that_makes_ranks_itself_is_refused_when_it_begins_to_train(monkeypatch):
+    with joint() as host:
+        monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
+        monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 2)
+        with pytest.raises(RanksError, match=r"torch\.distributed with 2 processes"):
+            host.model()
+
+
 @pytest.mark.parametrize("said", ["1", "", "many"])
 def test_one_rank_is_no_reason_to_refuse(said, monkeypatch):
-    from fragprune_plugins.injection import ranks
-
     monkeypatch.setenv("WORLD_SIZE", said)
     ranks.expect_one()
-
-
-def as_two_ranks(root: Path, scene: Path) -> str:
-    """Run the host as one of two ranks that it makes itself; the other rank is a fork of us."""
-    import torch
-
-    meet = {"backend": "gloo", "init_method": f"file://{root / 'meet'}", "world_size": 2}
-    other = os.fork()
-    if other == 0:
-        torch.distributed.init_process_group(rank=1, **meet)
-        torch.distributed.barrier()
-        os._exit(0)
-    line = "    gaussians = GaussianModel(dataset.sh_degree)\n"
-    ranks = (
-        f"    torch.distributed.init_process_group(rank=0, **{meet})\n"
-        "    torch.distributed.barrier()\n"
-    )
-    edit(root / "host/train.py", line, ranks + line)
-    try:
-        trained(root, scene, JOINT)
-    except RanksError as error:
-        return error.found
-    finally:
-        os.waitpid(other, 0)
-    return "not refused"
-
-
-def test_a_host_that_makes_ranks_itself_is_refused_when_it_begins_to_train(photographs, tmp_path):
-    written(Host, tmp_path / "host")
-    assert fresh(as_two_ranks, tmp_path, photographs) == "torch.distributed with 2 processes"
