@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from miniatures.skeletons import skeleton
 
 from fragprune_graphdeco.adapter import resolution
 from fragprune_plugins.adapting import HostRepo, NotComparedError, Photographs, Resolution
@@ -66,19 +65,15 @@ def test_which_numbers_are_divisors_is_read_from_the_source(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "source", ["", "def loadCam(args):\n    if args.resolution in [1, 2]: 1200\n"]
+    "source", [None, "", "def loadCam(args):\n    if args.resolution in [1, 2]: 1200\n"]
 )
 def test_another_way_of_choosing_the_size_is_refused(tmp_path, source):
     file = tmp_path / "utils" / "camera_utils.py"
     file.parent.mkdir()
-    file.write_text(source)
+    if source is not None:
+        file.write_text(source)
     with pytest.raises(NotComparedError, match=r"utils/camera_utils\.py|do not know"):
         resolution(HostRepo(tmp_path), 2)
-
-
-def test_a_host_without_that_file_is_refused(tmp_path):
-    with pytest.raises(NotComparedError):
-        Vanilla3DGS().photographs(skeleton(tmp_path), ["-s", "x", "--eval"])
 
 
 def test_folder_background_and_images_are_the_commands():
