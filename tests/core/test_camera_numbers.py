@@ -55,9 +55,8 @@ def test_a_camera_that_is_broken_is_named_by_its_number(tmp_path):
     assert caught.value.where == str(path)
     with pytest.raises(DatasetError, match=r"\[0\] \(no 'fy'\)"):
         load_cameras(written(path, [{k: v for k, v in entry().items() if k != "fy"}]))
-    with pytest.raises(DatasetError) as caught:
+    with pytest.raises(DatasetError, match=f"{path}: 0 cameras;"):
         load_cameras(written(path, []))
-    assert (caught.value.where, caught.value.found) == (str(path), "0 cameras")
 
 
 def test_divided_views_have_the_sizes_of_divided_photographs(tmp_path):
@@ -159,36 +158,6 @@ def test_a_blender_scene_is_its_two_files(tmp_path):
 HALF = math.sqrt(0.5)  # a quarter turn about z, as a quaternion w, x, y, z
 
 
-def test_a_colmap_model_in_text_gives_every_number(tmp_path):
-    model = tmp_path / "sparse"
-    model.mkdir()
-    (model / "cameras.txt").write_text(
-        "# comment\n\n7 PINHOLE 40 20 30 25 19 11\n8 SIMPLE_PINHOLE 50 60 70 25 30\n"
-    )
-    lines = [
-        f"1 {2 * HALF} 0 0 {2 * HALF} 1 2 3 7 sub/b c.png",
-        "0 0 -1",
-        "2 1 0 0 0 0 0 0 8 a.png",
-    ]
-    (model / "images.txt").write_text("# comment\n" + "\n".join(lines) + "\n\n")
-    (tmp_path / "images").mkdir()
-    train, test = colmap.read(tmp_path)
-    ((first, plain, *_),) = test
-    ((second, turned, path, *_),) = train
-    assert (first, second) == ("a.png", "sub/b c.png")  # of the sorted names the first is held out
-    assert path == tmp_path / "images/b c.png"
-    assert (turned.width, turned.height, turned.fx, turned.fy) == (40, 20, 30.0, 25.0)
-    assert (turned.cx, turned.cy) == (19.0, 11.0)
-    assert (plain.width, plain.height, plain.fx, plain.fy) == (50, 60, 70.0, 70.0)
-    assert (plain.cx, plain.cy) == (25.0, 30.0)
-    torch.testing.assert_close(turned.rotation, torch.tensor(TURN, dtype=torch.float64))
-    assert turned.translation.tolist() == PLACE
-    (tmp_path / "images/sub").mkdir()
-    (tmp_path / "images/sub/b c.png").touch()
-    assert colmap.read(tmp_path)[0][0][2] == tmp_path / "images/sub/b c.png"
-    assert colmap.read(tmp_path, "images_4")[0][0][2] == tmp_path / "images_4/b c.png"
-
-
 @pytest.mark.parametrize(
     "quaternion", [(0.5, 0.5, 0.5, 0.5), (0.1, 0.2, 0.3, 0.4), (-3.0, 1.0, 2.0, -1.0)]
 )
@@ -225,15 +194,43 @@ def image(name=b"a.png", number=7, points=2):
     return numbers + name + b"\0" + struct.pack("<Q", points) + b"p" * 24 * points
 
 
-def test_a_colmap_model_in_binary_gives_every_number(tmp_path):
-    cameras = [camera(), camera(8, 0, 70.0, 25.0, 30.0)]
-    train, test = binary(tmp_path, cameras, [image(b"b.png"), image(b"a.png", 8, 0)])
-    assert [row[0] for row in (*test, *train)] == ["a.png", "b.png"]
-    assert (train[0][1].fx, train[0][1].fy, train[0][1].cx, train[0][1].cy) == (30, 25, 19, 11)
-    assert (test[0][1].fx, test[0][1].fy, test[0][1].cx, test[0][1].cy) == (70, 70, 25, 30)
-    assert (train[0][1].width, train[0][1].height) == (40, 20)
-    torch.testing.assert_close(train[0][1].rotation, torch.tensor(TURN, dtype=torch.float64))
-    assert train[0][1].translation.tolist() == PLACE
+def text(tmp_path):
+    model = tmp_path / "sparse"
+    model.mkdir()
+    (model / "cameras.txt").write_text(
+        "# comment\n\n7 PINHOLE 40 20 30 25 19 11\n8 SIMPLE_PINHOLE 40 20 70 25 30\n"
+    )
+    lines = [
+        f"1 {2 * HALF} 0 0 {2 * HALF} 1 2 3 7 sub/b c.png",
+        "0 0 -1",
+        "2 1 0 0 0 0 0 0 8 a.png",
+    ]
+    (model / "images.txt").write_text("# comment\n" + "\n".join(lines) + "\n\n")
+
+
+def both_in_binary(tmp_path):
+    images = [image(b"sub/b c.png"), image(b"a.png", 8, 0)]
+    binary(tmp_path, [camera(), camera(8, 0, 70.0, 25.0, 30.0)], images)
+
+
+@pytest.mark.parametrize("write", [text, both_in_binary])
+def test_a_colmap_model_gives_every_number(tmp_path, write):
+    (tmp_path / "images").mkdir()
+    write(tmp_path)
+    train, test = colmap.read(tmp_path)
+    ((first, plain, *_),) = test
+    ((second, turned, path, *_),) = train
+    assert (first, second) == ("a.png", "sub/b c.png")  # of the sorted names the first is held out
+    assert path == tmp_path / "images/b c.png"
+    assert (turned.width, turned.height, turned.fx, turned.fy) == (40, 20, 30.0, 25.0)
+    assert (turned.cx, turned.cy) == (19.0, 11.0)
+    assert (plain.fx, plain.fy, plain.cx, plain.cy) == (70.0, 70.0, 25.0, 30.0)
+    torch.testing.assert_close(turned.rotation, torch.tensor(TURN, dtype=torch.float64))
+    assert turned.translation.tolist() == PLACE
+    (tmp_path / "images/sub").mkdir()
+    (tmp_path / "images/sub/b c.png").touch()
+    assert colmap.read(tmp_path)[0][0][2] == tmp_path / "images/sub/b c.png"
+    assert colmap.read(tmp_path, "images_4")[0][0][2] == tmp_path / "images_4/b c.png"
 
 
 @pytest.mark.parametrize("code", [7, 10, 11, -1])

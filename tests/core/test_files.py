@@ -47,16 +47,6 @@ def test_a_file_where_a_folder_should_be_is_stated(tmp_path):
         pass
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_folder_without_permission_is_stated(tmp_path):
-    tmp_path.chmod(0o500)
-    try:
-        with pytest.raises(OutputError, match="Permission denied"), replacing(tmp_path / "x"):
-            pass
-    finally:
-        tmp_path.chmod(0o700)
-
-
 @pytest.mark.parametrize("mask", [0o022, 0o077])
 @pytest.mark.parametrize("way", ["put", "durable", "plain"])
 def test_permissions_follow_the_users_mask_and_the_mask_stays(tmp_path, mask, way):
@@ -97,9 +87,8 @@ def test_a_lock_is_for_one_at_a_time_and_leaves_nothing(tmp_path, monkeypatch):
         assert alone
         with locked(path, what="another"), locked(tmp_path / "b.txt"):
             pass
-        with pytest.raises(OutputError, match="another process") as caught, locked(path):
+        with pytest.raises(OutputError, match=f"{path}: .*another process"), locked(path):
             pass
-        assert caught.value.where == str(path)
     with locked(path):
         pass
     assert list(tmp_path.iterdir()) == []
@@ -148,10 +137,8 @@ def test_a_writable_folder_is_made_and_left_empty(tmp_path):
         assert writable_folder(str(tmp_path / "a" / "b")) == tmp_path / "a" / "b"
     assert list((tmp_path / "a" / "b").iterdir()) == []
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError) as caught:
+    with pytest.raises(OutputError, match=r"/file/x: cannot be written \(Not a directory\);"):
         writable_folder(tmp_path / "file" / "x")
-    assert caught.value.where == str(tmp_path / "file" / "x")
-    assert caught.value.found == "cannot be written (Not a directory)"
 
 
 def test_digest_is_sha256_and_holds_no_file_in_memory(tmp_path):

@@ -65,11 +65,6 @@ def test_a_table_that_is_cut_off_says_in_which_row(tmp_path, kind, body, said):
         table(tmp_path / "a", kind, body, *before)
 
 
-def test_text_that_is_no_number_is_refused(tmp_path):
-    with pytest.raises((ValueError, DeprecationWarning)):
-        table(tmp_path / "a", b"ascii", b"1 2 3 four 5 6 7 8")
-
-
 @pytest.mark.parametrize("line", [b"comment \xff \x00", b"obj_info made by hand", b"", b"comment"])
 def test_lines_for_people_are_passed_over(tmp_path, line):
     columns, _ = table(tmp_path / "a", b"binary_little_endian", binary(ROWS), line)

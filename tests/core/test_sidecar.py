@@ -74,10 +74,8 @@ def test_thresholds_of_other_rows_than_the_models_are_refused_with_both_counts(
     model, trained, rows
 ):
     sidecar.save(model, trained)
-    with pytest.raises(SidecarError) as caught:
+    with pytest.raises(SidecarError, match=f"thresholds of 6 Gaussian.*; expected {rows}, one"):
         sidecar.load(model, rows)
-    assert "6" in caught.value.found
-    assert str(rows) in caught.value.expected
 
 
 def bytes_of(change):

@@ -35,10 +35,8 @@ def engine(request):
 @pytest.mark.parametrize("rows", [0, 1, 299, 301])
 def test_thresholds_of_another_model_are_refused_with_both_counts(engine, rows):
     inputs = scenes.random_scene(0, 300)
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError, match=rf"\({rows},\).*; expected.*\(300,\)"):
         engine.rasterize(inputs, torch.full((rows,), 0.1))
-    assert f"({rows},)" in caught.value.found
-    assert "(300,)" in caught.value.expected
 
 
 def test_thresholds_that_are_no_array_are_refused(engine):
