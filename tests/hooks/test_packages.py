@@ -107,8 +107,7 @@ print(json.dumps([result.stdout for result in results]))
 def model(tmp_path: Path) -> Path:
     path = tmp_path / "model.ply"
     write_ply(path, tiny.random_model())
-    cameras = tiny.transforms(["a"], tiny.cameras()[:1]) | {"w": 20, "h": 12}
-    (tmp_path / "cameras.json").write_text(json.dumps(cameras))
+    tiny.write_path(tmp_path / "cameras.json", ["a"])
     return path
 
 

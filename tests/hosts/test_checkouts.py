@@ -17,7 +17,6 @@ from pathlib import Path
 
 import pytest
 from hosts.training import STEPS, learned
-from miniatures.skeletons import STATES
 
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.testing.conformance import found_adapter
@@ -48,42 +47,7 @@ def each_of(name: str, *more: object) -> list:
     return [pytest.param(path, *more, id=path.name) for path in checkouts(name)] or [none]
 
 
-DIALECTS = {  # settings, and values that come back
-    "2dgs": (12, 3),
-    "4dgaussians": (12, 3),
-    "light-gaussian": (13, 2),
-    "mcmc": (12, 3),
-    "mini-splatting": (12, 2),
-    "mip-splatting": (14, 2),
-    "rain-gs": (13, 3),
-    "rt-4dgs": (18, 6),
-}
-
-
-@pytest.mark.parametrize(
-    ("host", "name"), [case for name in DIALECTS for case in each_of(name, name)]
-)
-def test_every_dialect_is_read_and_vanillas_adapter_keeps_out(host, name):
-    adapter, repo = found_adapter(name), HostRepo(host)
-    dialect = adapter.dialect(repo)
-    assert (len(dialect.settings), dialect.outputs) == DIALECTS[name]
-    assert adapter.command_line(repo).default_iterations == 30_000
-    assert not Vanilla3DGS().match(repo).fits
-
-
 every_vanilla = pytest.mark.parametrize("host", each_of("vanilla-3dgs"))
-
-
-@every_vanilla
-def test_the_state_of_vanilla_is_a_known_one(host):
-    adapter, repo = Vanilla3DGS(), HostRepo(host)
-    state = adapter.revision(repo)
-    assert state in STATES
-    dialect = adapter.dialect(repo)
-    assert len(dialect.settings) == (13 if "2024" in state else 11 + (state != "mid-July 2023"))
-    assert dialect.outputs == (3 if "2024" in state else 2)
-    assert dialect.sparse_adam == (state == "October 2024")
-    assert adapter.command_line(repo).default_iterations == 30_000
 
 
 @dataclass(frozen=True)
