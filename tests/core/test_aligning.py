@@ -12,9 +12,6 @@ from fragprune_plugins.injection.session import OF_MODELS
 LOGITS = -3 + torch.arange(6.0) / 8
 
 
-ROWS = (Role.PARENTS, Role.KEEP, Role.APPEND, Role.REARRANGE, Role.STILL)
-
-
 @pytest.fixture
 def session():
     return state(freeze=False)
@@ -51,19 +48,21 @@ def parents(session, model, rows, body):
 def test_a_parent_without_a_child_is_refused_with_their_number(session):
     model, known = follow(session)
     rows = torch.tensor([4, 1, 5])
-    with pytest.raises(AlignmentError, match="2 selected parents without a child") as caught:
+    with pytest.raises(AlignmentError, match="host:f: 2 selected parents without a child"):
         parents(session, model, rows, lambda: append(session, model, rows[:1]))
-    assert caught.value.where == "host:f"
     assert known.pending_parents is None
 
 
-@pytest.mark.parametrize("rows", [[4, 2, 5], [4, 1, 5, 3]])
-def test_what_is_no_copy_of_its_parent_is_refused_before_the_host_appends(session, rows):
+@pytest.mark.parametrize(
+    ("rows", "moved"),
+    [([4, 2, 5], ()), ([4, 1, 5, 3], ()), ([4, 1, 5], ["xyz"]), ([4, 1, 5], ["o"])],
+)
+def test_what_is_no_copy_of_its_parent_is_refused_before_the_host_appends(session, rows, moved):
     model, known = follow(session)
     appended = []
 
     def body():
-        tensors = {name: each[rows].clone() for name, each in model.rows().items()}
+        tensors = {name: each[rows] + (name in moved) for name, each in model.rows().items()}
         OF_MODELS[Role.APPEND](session, call(model, Role.APPEND, appended.append, tensors))
 
     with pytest.raises(AlignmentError, match=f"{len(rows)} new rows that are not copies"):
@@ -73,19 +72,7 @@ def test_what_is_no_copy_of_its_parent_is_refused_before_the_host_appends(sessio
     assert known.pending_parents is None
 
 
-def test_a_row_that_differs_in_one_inherited_group_is_no_copy(session):
-    model, _ = follow(session)
-    tensors = {name: each[[2]].clone() for name, each in model.rows().items()}
-    tensors["o"] += 1
-
-    def body():
-        OF_MODELS[Role.APPEND](session, call(model, Role.APPEND, lambda tensors: None, tensors))
-
-    with pytest.raises(AlignmentError, match="not copies"):
-        parents(session, model, torch.tensor([2]), body)
-
-
-@pytest.mark.parametrize("role", ROWS)
+@pytest.mark.parametrize("role", [Role.PARENTS, Role.KEEP, Role.APPEND, Role.REARRANGE, Role.STILL])
 def test_a_model_that_is_not_followed_is_the_hosts_own_business(session, role):
     seam = call(Model(3), role, lambda tensors: f"done with {tensors}", "these")
     assert OF_MODELS[role](session, seam) == "done with these"
@@ -122,9 +109,8 @@ def test_an_operation_that_did_nothing_changes_nothing(session, trace):
 
 def test_an_operation_whose_rows_nobody_traced_is_refused(session):
     model, _ = follow(session)
-    with pytest.raises(AlignmentError, match="4 Gaussians") as caught:
+    with pytest.raises(AlignmentError, match="host:f: 4 Gaussians"):
         rearrange(session, model, RowTrace(), torch.arange(4))
-    assert caught.value.where == "host:f"
 
 
 @pytest.mark.parametrize("role", [Role.REARRANGE, Role.STILL])

@@ -53,6 +53,16 @@ def step(it: Stage2, *views: str, loss: float = 0.5):
     return terms
 
 
+def whole(it: Stage2, view: str = "a", fragments: float = 20.0):
+    """A step in which a view is drawn without thresholds, and feels no pressure."""
+    it.begin(lambda: OPACITIES)
+    assert it.thresholds(None) is None
+    drawn = drawing(None, fragments)
+    assert it.on_drawn(view, drawn, lambda: drawn) is None
+    it.end()
+    assert it.store.neutral
+
+
 def test_a_step_is_told_once_with_what_its_views_drew_and_lost():
     told = []
     it = stage(watch=told.append)
@@ -117,11 +127,7 @@ def test_a_warm_up_draws_without_thresholds_and_counts_what_came_in():
     it = stage(
         settings=Settings(iterations=2001, train="all", goal=Pressure(1e-2)), watch=told.append
     )
-    it.begin(lambda: OPACITIES)
-    assert it.thresholds(None) is None
-    assert it.on_drawn("a", drawing(None, 20.0), lambda: drawing(None, 20.0)) is None  # no pressure
-    it.end()
-    assert it.store.neutral
+    whole(it)
     assert not it.viewed
     step(it, "a")
     it.close()
@@ -132,9 +138,7 @@ def test_a_warm_up_draws_without_thresholds_and_counts_what_came_in():
 
 def test_fragments_before_and_after_are_of_the_same_views():
     it = stage(settings=Settings(iterations=2001, train="all", goal=Pressure(1e-2)))
-    it.begin(lambda: OPACITIES)
-    it.on_drawn("rich", drawing(None, 90.0), lambda: drawing(None, 90.0))
-    it.end()
+    whole(it, "rich", 90.0)
     assert it.progress().fragments_before == 90.0
     step(it, "a")
     assert it.progress().fragments_before == 20.0
@@ -151,12 +155,8 @@ def test_rates_follow_the_schedule():
 def test_a_control_draws_without_thresholds_and_still_counts():
     told = []
     it = stage(settings=Settings(iterations=10, goal=Control()), watch=told.append)
-    it.begin(lambda: OPACITIES)
-    assert it.thresholds(None) is None
-    assert it.on_drawn("a", drawing(None, 20.0), lambda: drawing(None, 20.0)) is None
-    it.end()
+    whole(it)
     it.close()
-    assert it.store.neutral
     assert it.store.steps == 0
     assert [stats.fragments_per_pixel for stats in told] == [20.0]
 

@@ -61,17 +61,6 @@ def test_copies_made_while_we_were_there_are_restored_too(host, monkeypatch):
     assert other.draw("view", "model") == original("view", "model")  # by another name: inert
 
 
-def test_a_wrapped_function_is_called_through_us_and_restored_identically(host):
-    original, calls = host.render, []
-    ledger = PatchLedger()
-    ledger.wrap(seam("render", "view", "model"), noting(calls))
-    assert host.render is not original
-    assert host.render(1, model=2) == ("drawn", 1, 2, 1.0)
-    assert calls == [((1,), {"model": 2})]
-    assert ledger.undo() == []
-    assert host.render is original
-
-
 def test_an_inherited_method_leaves_no_copy_on_the_subclass(host):
     original, before = host.Base.save, dict(vars(host.Model))
     ledger, calls = PatchLedger(), []
@@ -105,10 +94,9 @@ def test_a_missing_function_is_refused_by_name(host, attribute):
 
 def test_a_missing_parameter_is_refused_with_the_signature_found(host):
     original, ledger = host.render, PatchLedger()
-    with pytest.raises(SeamError) as caught:
+    says = r": parameters \(view, model, scale\); expected also kernel_size\."
+    with pytest.raises(SeamError, match=says):
         ledger.wrap(seam("render", "view", "kernel_size"), noting([]))
-    assert caught.value.found == "parameters (view, model, scale)"
-    assert caught.value.expected == "also kernel_size"
     assert host.render is original
 
 
@@ -116,10 +104,8 @@ def test_a_function_bound_by_name_elsewhere_is_refused_with_the_holder(host, mon
     holder = ModuleType("a_script_that_came_first")
     holder.render = original = host.render
     monkeypatch.setitem(sys.modules, holder.__name__, holder)
-    with pytest.raises(LateImportError) as caught:
+    with pytest.raises(LateImportError, match=r"a_script_that_came_first;.*activate\(\)"):
         PatchLedger().wrap(seam("render"), noting([]))
-    assert "a_script_that_came_first" in caught.value.found
-    assert "activate()" in caught.value.remedy
     assert host.render is original
 
 
@@ -149,15 +135,6 @@ def test_under_a_foreign_wrapper_we_stay_inert_and_say_so(host):
     assert host.render is theirs
     assert host.render(1, 2) == ("theirs", ("drawn", 1, 2, 1.0))
     assert calls == []
-
-
-def test_a_module_reloaded_in_between_is_reported_not_raised(host):
-    ledger = PatchLedger()
-    ledger.wrap(seam("render"), noting([]))
-    exec(SOURCE, host.__dict__)
-    fresh = host.render
-    assert [f.code for f in ledger.undo()] == ["not-undone"]
-    assert host.render is fresh
 
 
 def test_undo_twice_is_harmless_and_a_ledger_that_is_over_wraps_nothing_more(host):
