@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import logging
 import shutil
 from dataclasses import replace
 from importlib import import_module
@@ -86,6 +85,14 @@ def running(folder, **options):
     return vanilla_3dgs.running(path=folder, drop_in=None, **options)
 
 
+@pytest.fixture
+def made(monkeypatch):
+    """Notes every proof that is made."""
+    made, prove = [], RasterizerProver.prove
+    monkeypatch.setattr(RasterizerProver, "prove", lambda *each: made.append(1) or prove(*each))
+    return made
+
+
 def draw(folder, *, turned=False, **options):
     """Draw one view under a session; its proofs."""
     with running(folder, **options) as host:
@@ -107,29 +114,28 @@ def test_outputs_are_told_by_their_numbers(host, difference):
     assert f"render ({RENDERER}:" in proved.call
 
 
-def test_black_points_lie_where_colours_are_cut_and_do_not_hinder_a_proof(host):
-    """Their harmonics give 0 but for rounding, on either side of the cut."""
+def black(model):
+    """Where colours are cut: the harmonics give 0 but for rounding, on either side of the cut."""
+    model._features_dc.copy_(torch.tensor(-0.5) / 0.28209479177387814)
+    model._features_rest.zero_()
+
+
+def long_and_thin(model):
+    """Of the determinant a c - b b float32 leaves few digits. A model has some such Gaussians."""
+    model._scaling[:4] = torch.tensor([9.0, 1e-4, 1e-4]).log()
+    model._rotation[:4] = torch.tensor([0.92, 0.0, 0.0, 0.38])  # 45 degrees on the picture
+    model._opacity[:4] = -3.9
+
+
+@pytest.mark.parametrize(("made", "count"), [(black, 40), (long_and_thin, 300)])
+def test_gaussians_that_a_host_rounds_otherwise_do_not_hinder_a_proof(host, made, count):
     with running(host("none")) as started:
-        model = started.model(40, setup=False)
+        model = started.model(count, setup=False)
         with torch.no_grad():
-            model._features_dc.copy_(torch.tensor(-0.5) / 0.28209479177387814)
-            model._features_rest.zero_()
+            made(model)
         started.render(started.camera(96, 64), model)
         (proved,) = started.session.proofs.values()
     assert proved.outputs == EQUAL["none"]
-
-
-def test_a_host_may_round_what_is_long_and_thin(host):
-    """Of its determinant a c - b b float32 leaves few digits. A model has some such Gaussians."""
-    with running(host("none")) as started:
-        model = started.model(300, setup=False)
-        with torch.no_grad():
-            model._scaling[:4] = torch.tensor([9.0, 1e-4, 1e-4]).log()
-            model._rotation[:4] = torch.tensor([0.92, 0.0, 0.0, 0.38])  # 45 degrees on the picture
-            model._opacity[:4] = -3.9
-        started.render(started.camera(96, 64), model)
-        (proved,) = started.session.proofs.values()
-    assert proved is not None
 
 
 @pytest.mark.parametrize("difference", OTHERWISE)
@@ -148,16 +154,6 @@ def test_the_gradient_on_the_screen_matters_only_where_ours_draws_for_densificat
     assert proved.outputs[0].startswith("the picture, with another gradient on the screen")
 
 
-def test_a_kept_proof_is_of_what_proved_it(host, monkeypatch):
-    folder, proved = host("none"), []
-    prove = RasterizerProver.prove
-    monkeypatch.setattr(RasterizerProver, "prove", lambda *each: proved.append(1) or prove(*each))
-    for own in ("as it is", "as it is", "mended"):
-        monkeypatch.setattr("fragprune_graphdeco.proof._OWN", own)
-        draw(folder)
-    assert len(proved) == 2
-
-
 def test_every_difference_is_tried():
     assert {*EQUAL, *OTHERWISE, "scale modifier", "no background"} == DIFFERENCES.keys()
 
@@ -172,76 +168,75 @@ def test_normals_are_unknown_where_the_camera_stands_as_the_world_does(host):
         draw(host("normals"))
 
 
-def test_median_depth_is_made_with_thresholds(host):
+def with_thresholds(folder):
+    """What a host is given beside a picture with fixed thresholds, and a way to draw the same view
+    with other features.
+    """
     fixed = FixedThresholds(torch.linspace(0.02, 0.4, 40))
-    options = {"path": host("median depth"), "drop_in": None, "plugins": [fixed]}
-    settings = Settings(iterations=9, goal=Pressure(0.0))
-    with vanilla_3dgs.joint(settings, **options) as running:
+    options = {"path": folder, "drop_in": None, "plugins": [fixed]}
+    with vanilla_3dgs.joint(Settings(iterations=9, goal=Pressure(0.0)), **options) as running:
         model, camera = running.model(40), running.camera(96, 64)
         open_all(running, model)
         found = running.render(camera, model)["more"]
-        splats = fixed.inputs.splats
-        rows = replace(fixed.inputs, splats=replace(splats, features=None), means2d_hook=None)
-        weights = torch.cat(
-            [
-                ReferenceEngine()
-                .rasterize(replace(rows, splats=replace(splats, features=each)), fixed.values)
-                .features
-                for each in torch.eye(40).split(8, dim=1)
-            ]
-        )
-        expected = compiled.median_depth(weights, splats, fixed.inputs.view)
-        off = (found[0] - expected).abs() > 1e-3
-        assert off.sum() <= off.numel() // 200
-        assert expected.gt(0).any()
+
+    def again(features):
+        splats = replace(fixed.inputs.splats, features=features)
+        inputs = replace(fixed.inputs, splats=splats, means2d_hook=None)
+        return ReferenceEngine().rasterize(inputs, fixed.values)
+
+    return found, again, fixed.inputs
+
+
+def test_median_depth_is_made_with_thresholds(host):
+    found, again, inputs = with_thresholds(host("median depth"))
+    weights = torch.cat([again(each).features for each in torch.eye(40).split(8, dim=1)])
+    expected = compiled.median_depth(weights, inputs.splats, inputs.view)
+    off = (found[0] - expected).abs() > 1e-3
+    assert off.sum() <= off.numel() // 200
+    assert expected.gt(0).any()
 
 
 @pytest.mark.parametrize("difference", ["depth", "depth without gradient", "depth over alpha"])
 def test_an_output_that_was_found_is_made_with_thresholds(host, difference):
-    fixed = FixedThresholds(torch.linspace(0.02, 0.4, 40))
-    settings = Settings(iterations=9, goal=Pressure(0.0))
-    options = {"path": host(difference), "drop_in": None, "plugins": [fixed]}
-    with vanilla_3dgs.joint(settings, **options) as running:
-        model, camera = running.model(40), running.camera(96, 64)
-        open_all(running, model)
-        found = running.render(camera, model)["more"]
-        view, splats = fixed.inputs.view, fixed.inputs.splats
-        depths = splats.means @ view.viewmatrix[:3, 2:3] + view.viewmatrix[3, 2]
-        inputs = replace(fixed.inputs, splats=replace(splats, features=depths))
-        drawn = ReferenceEngine().rasterize(inputs, fixed.values)
-        expected = DIFFERENCES[difference].also[0](drawn)
-        torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-4)
-        assert found.requires_grad == expected.requires_grad
+    found, again, inputs = with_thresholds(host(difference))
+    view = inputs.view.viewmatrix
+    expected = DIFFERENCES[difference].also[0](
+        again(inputs.splats.means @ view[:3, 2:3] + view[3, 2])
+    )
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-4)
+    assert found.requires_grad == expected.requires_grad
+
+
+def scaled(session, model):
+    """Draw a model whose scales are multiplied."""
+    draw = import_module("gaussian_renderer").render
+    draw(session.camera(96, 64), model, session.driver.pipe(), torch.zeros(3), 1.5)
 
 
 def test_a_setting_with_another_value_is_proved_again(host, caplog):
     folder = host("scale modifier")
     with running(folder, learn=True) as session:
         model, camera = session.model(40), session.camera(96, 64)
-        draw = import_module("gaussian_renderer").render
-        black, pipe = torch.zeros(3), session.driver.pipe()
-        draw(camera, model, pipe, black)
-        draw(session.camera(64, 48, side=0.1), model, pipe, torch.ones(3))
+        session.render(camera, model)
+        session.render(session.camera(64, 48, side=0.1), model, torch.ones(3))
         model.active_sh_degree = 0
-        draw(camera, model, pipe, black)
+        session.render(camera, model)
         assert len(session.session.proofs) == 2  # views and bands need no other than black and lit
         with pytest.raises(ProofError, match="another picture"):
-            draw(camera, model, pipe, black, 1.5)
+            scaled(session, model)
     with running(folder) as session:  # the host's own stage: stage 2 would refuse it
-        model, camera = session.model(40, setup=False), session.camera(96, 64)
-        draw = import_module("gaussian_renderer").render
-        draw(camera, model, pipe, black)
-        draw(camera, model, pipe, black, 1.5)
+        model = session.model(40, setup=False)
+        session.render(session.camera(96, 64), model)
+        scaled(session, model)
     assert "another picture" in caplog.text
 
 
 def test_a_background_that_lights_is_proved_by_itself(host):
     with running(host("no background"), learn=True) as session:
         model, camera = session.model(40), session.camera(96, 64)
-        draw = import_module("gaussian_renderer").render
-        draw(camera, model, session.driver.pipe(), torch.zeros(3))
+        session.render(camera, model)
         with pytest.raises(ProofError, match="another picture"):
-            draw(camera, model, session.driver.pipe(), torch.ones(3))
+            session.render(camera, model, torch.ones(3))
 
 
 def antialiased(folder):
@@ -267,16 +262,15 @@ def adapted(**members):
     return type("Adapter", (Vanilla3DGS,), {"dialect_type": dialect})()
 
 
-def test_whoever_trusts_it_is_told_and_goes_on(host, caplog):
-    assert draw(host("dilation"), learn=True, trust=True) == [None]
+@pytest.mark.parametrize(
+    ("by", "known"),
+    [({"trust": True}, ""), ({"adapter": adapted(otherwise="it widens more")}, "it widens more")],
+    ids=["whoever trusts it", "its adapter"],
+)
+def test_a_host_that_draws_otherwise_may_go_on_if_someone_says_so(host, caplog, by, known):
+    assert draw(host("dilation"), learn=True, **by) == [None]
     assert "another picture" in caplog.text
-
-
-def test_an_adapter_can_say_that_its_host_draws_otherwise(host, caplog):
-    adapter = adapted(otherwise="it widens more")
-    assert draw(host("dilation"), adapter=adapter, learn=True) == [None]
-    assert "another picture" in caplog.text
-    assert "as known: it widens more" in caplog.text
+    assert ("as known: it widens more" in caplog.text) == bool(known)
 
 
 def test_a_call_that_no_engine_of_ours_draws_is_left_to_the_host(host):
@@ -286,11 +280,8 @@ def test_a_call_that_no_engine_of_ours_draws_is_left_to_the_host(host):
     assert draw(host("none"), adapter=adapted(unpack=unpack)) == [None]
 
 
-def test_a_proof_is_kept_until_the_rasterizer_changes(host, monkeypatch):
-    folder, made = host("none"), []
-    prove = RasterizerProver.prove
-    counted = lambda *call: made.append(1) or prove(*call)  # noqa: E731
-    monkeypatch.setattr(RasterizerProver, "prove", counted)
+def test_a_proof_is_kept_until_the_rasterizer_or_what_proves_it_changes(host, made, monkeypatch):
+    folder = host("none")
     first, second = draw(folder), draw(folder)
     assert first == second
     assert len(made) == 1
@@ -302,14 +293,13 @@ def test_a_proof_is_kept_until_the_rasterizer_changes(host, monkeypatch):
     assert run_json("check", folder)["proved"] == []
     draw(folder)
     assert len(made) == 2
+    monkeypatch.setattr(proof, "_OWN", "mended")
+    draw(folder)
+    assert len(made) == 3
 
 
-def test_a_failed_proof_is_kept_and_not_repeated(host, monkeypatch):
-    folder, made = host("dilation"), []
-    prove = RasterizerProver.prove
-    counted = lambda *call: made.append(1) or prove(*call)  # noqa: E731
-    monkeypatch.setattr(RasterizerProver, "prove", counted)
-    said = set()
+def test_a_failed_proof_is_kept_and_not_repeated(host, made):
+    folder, said = host("dilation"), set()
     for _ in range(2):
         with pytest.raises(ProofError) as refused:
             draw(folder, learn=True)
@@ -320,7 +310,6 @@ def test_a_failed_proof_is_kept_and_not_repeated(host, monkeypatch):
     assert (checked.exit_code, told["proved"]) == (1, [])
     assert "another picture" in told["failed"][0]
     assert "draws otherwise" in told["sentence"]
-    assert draw(folder, learn=True, trust=True) == [None]
 
 
 def test_a_proof_that_found_no_memory_counts_as_none(host, monkeypatch):
@@ -377,15 +366,6 @@ def test_a_host_may_have_torch_make_tensors_elsewhere(host, monkeypatch):
     with contextlib.suppress(NotImplementedError, RuntimeError):  # our engine draws for the host
         draw(host("none"))
     assert set(made) == {"cpu"}
-
-
-def test_a_stand_in_proves_nothing_and_says_so_once(caplog):
-    caplog.set_level(logging.INFO, logger="fragprune")
-    with vanilla_3dgs.running(learn=False, prove=True) as host:
-        host.render(host.camera(), host.model(setup=False))
-        host.render(host.camera(), host.model(setup=False))
-        assert not host.session.proofs
-    assert caplog.text.count("nothing is proved, because a stand-in of ours draws") == 1
 
 
 def test_a_session_that_never_draws_by_ours_proves_nothing(host):
