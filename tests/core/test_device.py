@@ -1,5 +1,7 @@
 """``--device cpu``: what names CUDA runs on the CPU, and afterwards nothing has happened."""
 
+import contextlib
+
 import pytest
 import torch
 
@@ -80,19 +82,13 @@ def test_checkpoints_load_to_the_cpu(tmp_path, where):
 
 @pytest.mark.parametrize("error", [None, ValueError, KeyboardInterrupt])
 def test_everything_is_put_back_however_the_block_ends(error):
-    names = list(redirection._SUBSTITUTES)
-    before = [getattr(torch.cuda, name) for name in names], torch.load, torch.Tensor.cuda
+    def substituted():
+        names = redirection._SUBSTITUTES
+        return [torch.load, torch.Tensor.cuda, *(getattr(torch.cuda, name) for name in names)]
 
-    def block():
-        with cpu_only():
-            assert torch.cuda.Event is not before[0][names.index("Event")]
-            if error:
-                raise error
-
-    if error:
-        with pytest.raises(error):
-            block()
-    else:
-        block()
-    after = [getattr(torch.cuda, name) for name in names], torch.load, torch.Tensor.cuda
-    assert after == before
+    before = substituted()
+    with pytest.raises(error) if error else contextlib.nullcontext(), cpu_only():
+        assert torch.cuda.Event not in before
+        if error:
+            raise error
+    assert substituted() == before

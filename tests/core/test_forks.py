@@ -22,6 +22,7 @@ def errors(repo):
 
 
 PACKAGE = "diff_gaussian_rasterization"
+LOOP, PARSES = "    for iteration in range(opt.iterations):\n", "\ndef read_flags"
 DEPTH = "D += depths[collected_id[j]] * alpha * T; out_depth[pix_id] = D;"
 WEIGHT = "weight += alpha * T; out_alpha[pix_id] = weight;"
 INVERSE = "E += (1 / depths[collected_id[j]]) * alpha * T; out_invdepth[pix_id] = E;"
@@ -128,9 +129,9 @@ ONE_PASS = {
         "        else:\n            loss.backward()\n",
     ),
     "another training instead": (
-        "\ndef read_flags",
+        PARSES,
         "\ndef refine(opt):\n    loss.backward()\n\n"
-        "if opt.refined:\n    refine(opt)\nelse:\n    training(opt, 0)\n\ndef read_flags",
+        f"if opt.refined:\n    refine(opt)\nelse:\n    training(opt, 0)\n{PARSES}",
     ),
 }
 
@@ -155,7 +156,7 @@ def test_a_value_that_is_only_handed_on_or_named_is_not_read(tmp_path):
 
 
 def test_a_value_that_only_an_option_reads_is_not_read_without_it(tmp_path):
-    option = "\ndef read_flags", "\nparser.add_argument('--sparse'{})\n\ndef read_flags"
+    option = PARSES, f"\nparser.add_argument('--sparse'{{}})\n{PARSES}"
     used = (
         "        loss.backward()",
         (
@@ -519,20 +520,16 @@ def test_values_may_be_others_where_no_script_sets_them(tmp_path, value, called,
     assert ("computed" in str(errors(repo))) == (called or first is not None)
 
 
-@pytest.mark.parametrize("name", ["gaussian_renderer/__init__.py", "train.py"])
-def test_values_are_others_where_something_beside_the_model_sets_them(tmp_path, name):
+@pytest.mark.parametrize(("before", "model"), [("    rasterizer = ", "pc"), (LOOP, "gaussians")])
+def test_values_are_others_where_something_beside_the_model_sets_them(tmp_path, before, model):
     returned = "        return self._xyz\n"
-    repo = fork(
-        tmp_path,
+    changes = [
         (returned, GETTER.format(returned)),
         ("sh_degree): ...", "sh_degree):\n        self._new = None"),
-    )
-    assert errors(repo) == []
-    path, told = tmp_path / name, {"train.py": "gaussians"}.get(name, "pc")
-    text = path.read_text()
-    at = text.index("    rasterizer = ") if told == "pc" else text.index("    for iteration in")
-    path.write_text(f"{text[:at]}    {told}._new = made\n{text[at:]}")
-    assert "computed" in str(errors(HostRepo(tmp_path)))
+    ]
+    assert errors(fork(tmp_path / "unset", *changes)) == []
+    changes.append((before, f"    {model}._new = made\n{before}"))
+    assert "computed" in str(errors(fork(tmp_path / "set", *changes)))
 
 
 SETUP = "gaussians.training_setup(opt)\n"
@@ -611,8 +608,8 @@ OVERRULES = {
 @pytest.mark.parametrize("what", OVERRULES)
 def test_a_script_that_overrules_the_folders_of_its_command_is_refused(tmp_path, what):
     sets, served = OVERRULES[what]
-    main = f"\nif __name__ == '__main__':\n    {sets}\n\ndef read_flags"
-    found = errors(fork(tmp_path, ("\ndef read_flags", main)))
+    main = f"\nif __name__ == '__main__':\n    {sets}\n{PARSES}"
+    found = errors(fork(tmp_path, (PARSES, main)))
     assert found == [] if served else "itself, whatever its command says" in found[0]
 
 
@@ -699,7 +696,6 @@ def test_a_result_may_be_unpacked_after_the_call(tmp_path, how):
 
 STATEMENT = "gaussians.thin_out(mask)"
 MORE = ('package["render"]', 'package["render"] + package["more"]')
-LOOP, PARSES = "    for iteration in range(opt.iterations):\n", "\ndef read_flags"
 CLAMPS = "gaussians._opacity.data.clamp_(0)"
 REFUSED = [
     (*MORE, "reads more of what it drew"),
@@ -829,7 +825,7 @@ def test_a_call_that_may_not_be_reached_or_not_fail_is_no_failure(tmp_path, what
         f"parser.add_argument('--{name}', default={value})"
         for name, value in (("rate", 0.0), ("thin", 1), ("save_iterations", []))
     )
-    flags = ("\ndef read_flags", f"\n{given}\n\ndef read_flags")
+    flags = (PARSES, f"\n{given}\n{PARSES}")
     inherits = ("class GaussianModel:", "class GaussianModel(nn.Module):")
     changes = [inherits] if "inherits" in what else []
     assert errors(fork(tmp_path, CALLED[what], flags, *changes)) == []
@@ -866,7 +862,7 @@ def test_what_an_option_changes_is_not_changed_without_it(tmp_path, test, what):
     repo = fork(
         tmp_path,
         ("\n        loss.backward()", ASKS.format(condition, CHANGES[what])),
-        ("\ndef read_flags", f"{MORE_FLAGS}{beside}{REFINES}\ndef read_flags"),
+        (PARSES, f"{MORE_FLAGS}{beside}{REFINES}{PARSES}"),
         ("    def __init__(self, sh_degree): ...", GROWN),
     )
     if not served:
@@ -892,7 +888,7 @@ def test_flags_are_written_out_as_argparse_completes_them(tmp_path, words):
     (tmp_path / "beside.py").write_text("def own(parser):\n    parser.add_argument('--model')\n")
     given = f"import beside{MORE_FLAGS}parser.add_argument('--iterations')\n"
     given += "parser.add_argument('--sparse')"
-    fork(tmp_path, ("\ndef read_flags", f"\n{given}\n\ndef read_flags"))
+    fork(tmp_path, (PARSES, f"\n{given}\n{PARSES}"))
     line = ForkAdapter().command_line(HostRepo(tmp_path))
     in_full = partial(line.in_full, tmp_path / "train.py")
     assert in_full([*words]) == BEGINNINGS[words]
@@ -902,10 +898,9 @@ def test_flags_are_written_out_as_argparse_completes_them(tmp_path, words):
 
 
 def test_the_model_that_the_scene_exports_is_the_one_that_is_read(tmp_path):
-    repo = fork(tmp_path)
-    other = (
-        (tmp_path / "scene/gaussian_model.py").read_text().replace("torch.sigmoid", "torch.tanh")
-    )
+    fork(tmp_path)
+    model = (tmp_path / "scene/gaussian_model.py").read_text()
+    other = model.replace("torch.sigmoid", "torch.tanh")
     (tmp_path / "scene/late_model.py").write_text(other)
     scene = tmp_path / "scene/__init__.py"
     scene.write_text(f"from scene.late_model import GaussianModel\n{scene.read_text()}")

@@ -63,29 +63,26 @@ OWNERS = {
     "SpacetimeSplats": spacetime.splats("joint", 20),
     "Moment": spacetime.moment(),
 }
-FIELDS = [
-    (kind, field.name)
-    for kind, owner in OWNERS.items()
-    for field in fields(owner)
-    if isinstance(getattr(owner, field.name), torch.Tensor)
-]
+
+
+def tensors_of(owner):
+    values = {field.name: getattr(owner, field.name) for field in fields(owner)}
+    return {name: each.detach() for name, each in values.items() if torch.is_tensor(each)}
 
 
 @pytest.mark.parametrize("kind", OWNERS)
 def test_a_field_that_is_no_array_of_its_numbers_is_refused_by_name(kind):
-    owner = OWNERS[kind]
-    for name in [name for each, name in FIELDS if each == kind]:
+    for name, value in tensors_of(OWNERS[kind]).items():
         for how in NONE.values():
             with pytest.raises(InputError, match=name):
-                replace(owner, **{name: how(getattr(owner, name).detach())})
+                replace(OWNERS[kind], **{name: how(value)})
 
 
 @pytest.mark.parametrize("kind", [kind for kind in OWNERS if kind not in ("View", "Moment")])
 def test_a_field_of_other_rows_is_refused(kind):
-    owner = OWNERS[kind]
-    for name in [name for each, name in FIELDS if each == kind]:
+    for name, value in tensors_of(OWNERS[kind]).items():
         with pytest.raises(InputError, match=r"shape \((19|27),"):
-            replace(owner, **{name: getattr(owner, name).detach()[:-1]})
+            replace(OWNERS[kind], **{name: value[:-1]})
 
 
 def test_tiles_are_whole_numbers():
