@@ -47,9 +47,6 @@ def each_of(name: str, *more: object) -> list:
     return [pytest.param(path, *more, id=path.name) for path in checkouts(name)] or [none]
 
 
-every_vanilla = pytest.mark.parametrize("host", each_of("vanilla-3dgs"))
-
-
 @dataclass(frozen=True)
 class Training:
     """How a host is trained in these tests.
@@ -58,14 +55,12 @@ class Training:
         flags: what the host needs beside ``FLAGS``.
         script: that trains.
         needs: packages that the host imports.
-        data: fixture with its photographs.
         checkpoint: of the iteration after which the host's training ends in an error of its own.
     """
 
     flags: str = "--port 0"
     script: str = "train.py"
     needs: tuple[str, ...] = ()
-    data: str = "dataset"
     checkpoint: int = 0
 
 
@@ -127,7 +122,7 @@ def test_training_then_fine_tuning(host, training, dataset, tmp_path):
     expect_opacities_moved_alone(fresh(learned, words, "auto", training.checkpoint, seconds=800))
 
 
-@every_vanilla
+@pytest.mark.parametrize("host", each_of("vanilla-3dgs"))
 def test_exposures_of_a_late_host_come_through_stage_two_unchanged(host, dataset, tmp_path):
     if "2023" in Vanilla3DGS().revision(HostRepo(host)):
         pytest.skip("this state has no exposures")
