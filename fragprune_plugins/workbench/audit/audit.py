@@ -47,17 +47,14 @@ SHOWN = 3
 
 REPEATS = 5
 
-OPACITIES = (0.1, 0.5)
-RADII = (8, 32)
-"""Limits of the classes of Gaussians: opacity, and the host's radius of 3 sigma in pixels."""
-
 DARK = 0.05
 """A fragment is behind what is opaque if less light than this is left for it."""
 
 RIM = math.exp(-2.0)
 """A fragment is at the rim where the falloff is below this: beyond 2 sigma."""
 
-FAINT = OPACITIES[0]
+FAINT = 0.1
+"""Opacity of a Gaussian that hides little."""
 
 REASONS = ("behind what is opaque", "at the rim, beyond 2 sigma", "of faint Gaussians", "others")
 """Where an idle fragment sits: the first that is true of it."""
@@ -74,51 +71,39 @@ class Idle:
 
     Attributes:
         weight: of those idle together, sum; a pixel has 1 at most.
-        classes: (2, 9) drawn, and idle together, by opacity and radius.
-        reasons: (2, 4) likewise by ``REASONS``.
+        reasons: (2, 4) all, and those idle together, by ``REASONS``.
     """
 
     __repr__ = one_line
 
     pixels: int = 0
-    drawn: int = 0
     alone: int = 0
-    together: int = 0
     weight: float = 0.0
-    classes: Tensor = field(default_factory=lambda: torch.zeros(2, 9, dtype=torch.int64))
     reasons: Tensor = field(default_factory=lambda: torch.zeros(2, 4, dtype=torch.int64))
 
-    def add(self, kinds: Tensor, tile: Weighed) -> None:
-        """Count the fragments of a tile whose Gaussians are of these kinds (K,), 0 to 8."""
+    def add(self, tile: Weighed) -> None:
+        """Count the fragments of a tile."""
         self.pixels += tile.drawn.shape[1]
-        for at, chosen in enumerate((tile.drawn, tile.together)):
-            per_row = chosen.sum(dim=1)
-            self.classes[at].index_add_(0, kinds.cpu(), per_row.cpu())
-            self.reasons[at] += tile.reasons[chosen].bincount(minlength=len(REASONS)).cpu()
-        self.drawn += int(tile.drawn.sum())
         self.alone += int(tile.alone.sum())
-        self.together += int(tile.together.sum())
         self.weight += float(tile.weights[tile.together].sum())
+        for at, chosen in enumerate((tile.drawn, tile.together)):
+            self.reasons[at] += tile.reasons[chosen].bincount(minlength=len(REASONS)).cpu()
 
     def as_dict(self) -> dict[str, Any]:
         """Shares, as plain values."""
-        drawn = max(self.drawn, 1)
-        share = (self.classes.double() / drawn).view(2, 3, 3).tolist()
+        fragments, together = self.reasons.sum(dim=1).tolist()
+        drawn = max(fragments, 1)
         return {
             "bound": HALF_LEVEL,
             "pixels": self.pixels,
-            "fragments": self.drawn,
+            "fragments": fragments,
             "alone": self.alone / drawn,
-            "together": self.together / drawn,
+            "together": together / drawn,
             "light": self.weight / max(self.pixels, 1),
             "reasons": [
                 {"name": name, "share": int(every) / drawn, "idle": int(idle) / drawn}
                 for name, every, idle in zip(REASONS, *self.reasons, strict=True)
             ],
-            "opacities": list(OPACITIES),
-            "radii": list(RADII),
-            "share_by_opacity_and_radius": share[0],
-            "idle_by_opacity_and_radius": share[1],
         }
 
 
@@ -240,7 +225,6 @@ class _Survey:
         self._asked: dict[str, list[float]] = {}
         self._overdraw: list[float] = []
         self._idle = Idle()
-        self._radii = torch.empty(0)
 
     def draw(self, name: str, view: View, shown: bool) -> None:
         """Draw a view of the model and of its cuts; if ``shown``, pictures show it."""
@@ -253,7 +237,6 @@ class _Survey:
             psnr_itself = psnr(out.image, itself.image)
             self._rows[label].append({"mse": float(error), "psnr": psnr_itself, **counts})
         assert itself is not None
-        self._radii = itself.radii
         inputs = self._itself.inputs(view)
         squared = extents.SQRT8.squared(opacities)
         ellipses = extents.covered(engine, replace(inputs, counts=True), squared)
@@ -270,14 +253,11 @@ class _Survey:
             self.shown.append(Shown(name, itself.image, itself.fragments, ellipses.fragments))
 
     def weigh(self, view: View, tiles: int) -> Iterator[None]:
-        """Weigh the fragments of the view that was drawn last, one by one; some tiles, in turns."""
-        opacities, radii = self._itself.splats.opacities, self._radii
+        """Weigh the fragments of a view, one by one; some tiles, in turns."""
         inputs = self._itself.inputs(view)
-        kinds = 3 * torch.bucketize(opacities, opacities.new_tensor(OPACITIES))
-        kinds += torch.bucketize(radii, radii.new_tensor(RADII))
         for tile in fragments(inputs, self._itself.thresholds(inputs), tiles):
             if len(tile.rows):
-                self._idle.add(kinds[tile.rows], weigh(tile, view.background))
+                self._idle.add(weigh(tile, view.background))
             yield
 
     def figures(self, frames: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -134,7 +134,7 @@ def compose(figures: Mapping[str, Any], folder: Path) -> str:
     Args:
         figures: of ``audit``, with "model", "cameras" and "maps".
     """
-    cuts, viewers, idle, kinds = _tables(figures)
+    cuts, viewers, idle = _tables(figures)
     return page.render(
         _TEMPLATE,
         title=f"What {Path(figures['model']).name} costs to draw",
@@ -147,12 +147,11 @@ def compose(figures: Mapping[str, Any], folder: Path) -> str:
         cuts=cuts,
         viewers=viewers,
         idle=idle,
-        kinds=kinds,
     )
 
 
 def _tables(figures: Mapping[str, Any]) -> list[page.Table]:
-    """Cuts, viewers, where idle fragments sit, and of which Gaussians they are."""
+    """Cuts, viewers, and where idle fragments sit."""
     idle = figures["idle"]
     first = figures["cuts"][0]["fragments_per_pixel"]
     cuts = [
@@ -192,22 +191,7 @@ def _tables(figures: Mapping[str, Any]) -> list[page.Table]:
         page.Table(head, cuts, said),
         page.Table(["viewer", "draws", "shaded/pixel", "against √8 quads"], viewers, shaded, 2),
         page.Table(["fragments", "of all", "idle together, of all", "of these"], reasons, _REASONS),
-        _kinds(idle),
     ]
-
-
-def _kinds(idle: Mapping[str, Any]) -> page.Table:
-    low, high = idle["opacities"]
-    opacities = (f"opacity below {low:g}", f"{low:g} to {high:g}", f"over {high:g}")
-    small, large = idle["radii"]
-    radii = (f"up to {small} px", f"{small + 1} to {large} px", f"over {large} px")
-    shares = idle["share_by_opacity_and_radius"]
-    spared = idle["idle_by_opacity_and_radius"]
-    rows = [
-        [name, *(f"{share:.1%} ({part:.1%})" for share, part in zip(*both, strict=True))]
-        for name, *both in zip(opacities, shares, spared, strict=True)
-    ]
-    return page.Table(["Gaussians", *(f"radius {name}" for name in radii)], rows, _KINDS_SAID)
 
 
 def _part(reason: Mapping[str, Any]) -> str:
@@ -232,15 +216,11 @@ _TITLES = (
     "Simple cuts, the same for all Gaussians; PSNR is against the picture as it is",
     "Pixels that each viewer shades for one pixel of the picture",
     "Where fragments are; idle together: all can go, no pixel changes by half an 8-bit level",
-    "Shares of all fragments by their Gaussian, and in brackets of those idle together",
 )
 """Of ``_tables``, where no page explains them."""
 
 _REASONS = f"""Each fragment counts where the first of these holds. Behind what is opaque: less than
 {DARK:.0%} of the light is left for it."""
-
-_KINDS_SAID = """Share of all fragments, and in brackets of those idle together. The radius is 3
-sigma, on the screen."""
 
 _OURS = "tiles by ellipse, 1/255 or cutoff; ends where opaque"
 

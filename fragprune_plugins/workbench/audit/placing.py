@@ -9,7 +9,6 @@ is closed all round looks like a room: then choose.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -52,14 +51,14 @@ class Placed:
 
     Attributes:
         side: "orbit" or "inside".
-        enclosed: share of directions that end on a surface, from the best place; NaN if no place
+        enclosed: share of directions that end on a surface, from the best place; None if no place
             was looked for.
     """
 
     views: Named
     side: str
     why: str
-    enclosed: float
+    enclosed: float | None = None
 
 
 @torch.no_grad()
@@ -74,7 +73,7 @@ def place(
     """
     pixels = 800 // divide
     if side == "orbit":
-        return Placed(_orbit(splat, count, pixels, engine), side, _AS_ASKED, math.nan)
+        return Placed(_orbit(splat, count, pixels, engine), side, _AS_ASKED)
     splats, near = splat.splats(), _NEAR * bounds(splat)[1]
     places = _clear(splat, near / _NEAR)
     shares = [enclosed(engine, splats, at, near) for at in bar(places, "looking from inside")]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +58,7 @@ def audit(
         "cameras": {
             "kind": placed.side,
             "why": placed.why,
-            "enclosed": None if math.isnan(placed.enclosed) else placed.enclosed,
+            "enclosed": placed.enclosed,
         },
         **measurements,
         "maps": None if out is None else page.draw(out, shown),
@@ -97,4 +96,4 @@ def _given(
     longest = max(max(view.width, view.height) for _, view in chosen)
     chosen = divided(chosen, divide or -(-longest // LARGEST))
     why = f"{len(chosen)} of the {every} cameras of {cameras or data}, evenly spread."
-    return Placed(chosen, "given", why, math.nan)
+    return Placed(chosen, "given", why)
