@@ -10,7 +10,8 @@ from fragprune_plugins.engines import create_engine
 from fragprune_plugins.types import RasterInputs, RasterOutputs
 from fragprune_plugins.workbench.bench import timing as bench
 from fragprune_plugins.workbench.bench.scene import make_scene, make_view
-from fragprune_plugins.workbench.bench.timing import Case, measure, translation
+from fragprune_plugins.workbench.bench.timing import Case, measure
+from fragprune_plugins.workbench.bench.work import _saved
 
 ROW = {
     *("scene", "width", "height", "gaussians", "pass", "engine", "device", "threads", "truncated"),
@@ -87,31 +88,16 @@ def test_gradients_start_from_nothing_each_time() -> None:
     assert seen == [0, 0, 0]
 
 
-def row(ms: float, fragments: float, truncated: bool, **others: Any) -> dict[str, Any]:
+def row(ms: float, fragments: float, truncated: bool) -> dict[str, Any]:
     given = {"scene": "s", "width": 8, "height": 6, "gaussians": 5, "pass": "forward"}
     figures = {"ms_median": ms, "fragments_per_pixel": fragments, "truncated": truncated}
-    return {**given, "engine": "cpu", **figures, **others}
+    return {**given, **figures}
 
 
-def test_translation_is_the_ratio_of_the_two_ratios() -> None:
-    found = translation([row(30, 50, False), row(20, 25, True)], "cpu")
+def test_what_was_saved_is_the_ratio_of_the_two_ratios() -> None:
+    found = _saved([row(30, 50, False), row(20, 25, True)])
     assert found == {"s 8x6": {"fragments": 2.0, "time": 1.5, "share": pytest.approx(0.75)}}
 
 
-def test_translation_pairs_rows_of_the_same_work_only() -> None:
-    rows = [
-        row(30, 50, False),
-        row(10, 50, False, width=16),
-        row(5, 25, True, width=16),
-        row(99, 50, False, **{"pass": "forward_backward"}),
-        row(1, 25, True, **{"pass": "forward_backward"}),
-        row(1, 25, True, engine="reference"),
-        row(1, 25, True, scene="other"),
-        row(1, 25, True, gaussians=6),
-    ]
-    assert translation(rows, "cpu") == {"s 16x6": {"fragments": 2.0, "time": 2.0, "share": 1.0}}
-    assert list(translation([*rows, row(15, 25, True)], "cpu")) == ["s 8x6", "s 16x6"]
-
-
-def test_a_picture_truncated_to_nothing_has_no_translation() -> None:
-    assert translation([row(30, 50, False), row(20, 0, True)], "cpu") == {}
+def test_a_picture_truncated_to_nothing_saved_nothing_that_has_a_share() -> None:
+    assert _saved([row(30, 50, False), row(20, 0, True)]) == {}

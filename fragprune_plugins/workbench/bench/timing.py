@@ -53,6 +53,19 @@ class Case:
         return self.splats.device
 
 
+def cases(
+    scene: str, view: View, splats: Splats, cut: Tensor, rules: Mapping[str, Any]
+) -> list[Case]:
+    """Both passes of a scene, each without truncation and then with.
+
+    Args:
+        cut: (N,) thresholds of truncated rows.
+        rules: ``Model.rules`` to draw truncated rows by.
+    """
+    plain = [Case(scene, view, splats, kind) for kind in PASSES]
+    return [each for case in plain for each in (case, replace(case, thresholds=cut, rules=rules))]
+
+
 def measure(
     cases: Sequence[Case],
     engines: Sequence[Engine],
@@ -124,48 +137,6 @@ def measure(
             }
         )
     return results
-
-
-def translation(results: Sequence[dict[str, Any]], engine: str) -> dict[str, dict[str, float]]:
-    """How much of the saved fragments becomes saved time, by scene and size, forward pass.
-
-    Returns:
-        For each "scene WIDTHxHEIGHT": ``fragments`` and ``time``, the ratios of untruncated to
-        truncated, and ``share``, time over fragments.
-    """
-    found: dict[str, dict[str, float]] = {}
-    rows: dict[bool, dict[Any, dict[str, Any]]] = {True: {}, False: {}}
-    for row in results:
-        if row["engine"] == engine and row["pass"] == "forward":
-            work = tuple(row[key] for key in ("scene", "width", "height", "gaussians"))
-            rows[row["truncated"]][work] = row
-    for work, plain in rows[False].items():
-        cut = rows[True].get(work)
-        if cut is not None and cut["fragments_per_pixel"] > 0:
-            time_ratio = plain["ms_median"] / cut["ms_median"]
-            fragments = plain["fragments_per_pixel"] / cut["fragments_per_pixel"]
-            share = time_ratio / fragments
-            name = "{scene} {width}x{height}".format(**plain)
-            found[name] = {"fragments": fragments, "time": time_ratio, "share": share}
-    return found
-
-
-def scaling(results: Sequence[dict[str, Any]], engine: str) -> dict[str, float] | None:
-    """The range of the time per fragment over scenes and sizes: untruncated, forward pass.
-
-    Returns:
-        ``least`` and ``most`` in ns per fragment, and their ``ratio``; None for fewer than two
-        rows.
-    """
-    prices = [
-        r["ns_per_fragment"]
-        for r in results
-        if r["engine"] == engine and r["pass"] == "forward" and not r["truncated"]
-    ]
-    known = [price for price in prices if price is not None]
-    if len(known) < 2:
-        return None
-    return {"least": min(known), "most": max(known), "ratio": max(known) / min(known)}
 
 
 def _prepare(case: Case, engine: Engine) -> Callable[[], RasterOutputs]:

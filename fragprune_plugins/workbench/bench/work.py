@@ -9,11 +9,10 @@ from typing import Any
 
 import click
 import torch
-from torch import Tensor
 
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.plugins.hooks import thresholds_for
-from fragprune_plugins.types import RasterInputs, Splats, View
+from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.bench import timing
 from fragprune_plugins.workbench.bench.scene import make_scene, make_view
 from fragprune_plugins.workbench.commands.command import Report
@@ -27,9 +26,6 @@ REPEATS = 9
 
 Size = tuple[int, int]
 
-Scene = tuple[str, Splats, View, Tensor, dict[str, Any]]
-"""Name, activated Gaussians, camera, and the thresholds (N,) and the rules of truncated rows."""
-
 
 def bench(
     *,
@@ -42,48 +38,34 @@ def bench(
     """Do what ``fragprune bench`` promises; its options are the arguments."""
     rasterizer, device = open_engine(engine)
     before = timing.load_average()
-    scenes = (
-        _generated(gaussians, sizes, device)
-        if model is None
-        else _of_model(model, cameras, sizes, device)
-    )
-    cases = [
-        timing.Case(name, view, splats, kind, *cut)
-        for name, splats, view, *truncation in scenes
-        for kind in timing.PASSES
-        for cut in ((), truncation)
-    ]
+    if model is None:
+        cases = _generated(gaussians, sizes, device)
+    else:
+        cases = _of_model(model, cameras, sizes, device)
     say = partial(click.echo, err=True)
     results = timing.measure(cases, [rasterizer], repeats=REPEATS, say=say)
     loads = {"load_before": before, "load_after": timing.load_average()}
-    saved = timing.translation(results, rasterizer.name)
-    one_scene = len({row["scene"] for row in results}) == 1
-    data = {
-        "results": results,
-        "translation": {
-            key.split()[-1] if one_scene else key: each["share"] for key, each in saved.items()
-        },
-        "saved": saved,
-        "scaling": timing.scaling(results, rasterizer.name),
-        "machine": timing.describe_machine(device) | loads,
-    }
+    machine = timing.describe_machine(device) | loads
+    data = {"results": results, "saved": _saved(results), "machine": machine}
     return Report(data, _table(data))
 
 
-def _generated(gaussians: tuple[int, ...], sizes: list[Size], device: torch.device) -> list[Scene]:
+def _generated(
+    gaussians: tuple[int, ...], sizes: list[Size], device: torch.device
+) -> list[timing.Case]:
     """A generated scene for each count of Gaussians and image size."""
-    scenes: list[Scene] = []
+    cases: list[timing.Case] = []
     for count in gaussians:
         for size in sizes:
             splats, view = make_scene(count).to(device).splats(), make_view(*size).to(device)
             cut = torch.full_like(splats.opacities, timing.TRUNCATION)
-            scenes.append((f"bench-{count}", splats, view, cut, {}))
-    return scenes
+            cases += timing.cases(f"bench-{count}", view, splats, cut, {})
+    return cases
 
 
 def _of_model(
     model: Path, cameras: Path | None, sizes: list[Size], device: torch.device
-) -> list[Scene]:
+) -> list[timing.Case]:
     """A model from its first camera, in each image size."""
     cameras = cameras or cameras_of(model)
     if cameras is None:
@@ -95,14 +77,31 @@ def _of_model(
         )
     loaded = load(model, device=device)
     splats, first = loaded.splats(), load_cameras(cameras)[0][1].to(device)
-    scenes = []
+    cases: list[timing.Case] = []
     for width, height in sizes:
         view = replace(first, width=width, height=height)
         cut = thresholds_for(RasterInputs(view, splats), loaded.thresholds)
         if cut is None:
             cut = torch.full_like(splats.opacities, timing.TRUNCATION)
-        scenes.append((model.stem, splats, view, cut.detach(), loaded.rules))
-    return scenes
+        cases += timing.cases(model.stem, view, splats, cut.detach(), loaded.rules)
+    return cases
+
+
+def _saved(results: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """How much of the saved fragments becomes saved time, by scene and size, forward pass.
+
+    Returns:
+        For each "scene WIDTHxHEIGHT": ``fragments`` and ``time``, the ratios of untruncated to
+        truncated, and ``share``, time over fragments.
+    """
+    forward, found = [row for row in results if row["pass"] == "forward"], {}
+    for plain, cut in zip(forward[::2], forward[1::2], strict=True):
+        if cut["fragments_per_pixel"] > 0:
+            fragments = plain["fragments_per_pixel"] / cut["fragments_per_pixel"]
+            time = plain["ms_median"] / cut["ms_median"]
+            name = "{scene} {width}x{height}".format(**plain)
+            found[name] = {"fragments": fragments, "time": time, "share": time / fragments}
+    return found
 
 
 def _table(data: dict[str, Any]) -> str:
@@ -127,11 +126,6 @@ def _table(data: dict[str, Any]) -> str:
         lines.append(
             f"{name}: {saved['fragments']:.2f}x fewer fragments, {saved['time']:.2f}x less time "
             f"({100 * saved['share']:.0f}% of it)"
-        )
-    if (prices := data["scaling"]) is not None:
-        lines.append(
-            f"a fragment costs {prices['least']:.2f} to {prices['most']:.2f} ns: "
-            f"{prices['ratio']:.1f}x between the cheapest and the dearest scene and size"
         )
     first, loads = results[0], "load unknown on this system"
     if machine["load_before"] is not None:

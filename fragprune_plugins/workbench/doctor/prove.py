@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import datetime
 import hashlib
-import math
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -172,11 +171,7 @@ def _times(
     for count, size in SCENES[kind]:
         splats, view = make_scene(count).to(kind).splats(), make_view(*size).to(kind)
         cut = torch.full_like(splats.opacities, timing.TRUNCATION)
-        cases = [
-            timing.Case(f"bench-{count}", view, splats, way, thresholds)
-            for way in timing.PASSES
-            for thresholds in (None, cut)
-        ]
+        cases = timing.cases(f"bench-{count}", view, splats, cut, {})
         plain = [case for case in cases if case.thresholds is None]
         rounds = [("truncation", cases, ours)]
         rounds += [("peers", plain, timed)] if len(timed) > len(ours) else []
@@ -187,15 +182,7 @@ def _times(
             rows = timing.measure(some, [each.engine for each in engines], repeats=repeats)
             names = [each.name for _ in some for each in engines]
             for name, row in zip(names, rows, strict=True):
-                yield {"round": what} | _finite(row) | {"engine": name}
-
-
-def _finite(row: dict[str, Any]) -> dict[str, Any]:
-    """None for what a peer does not count."""
-    return {
-        key: None if isinstance(each, float) and math.isnan(each) else each
-        for key, each in row.items()
-    }
+                yield {"round": what} | row | {"engine": name}
 
 
 def _hashes() -> dict[str, str]:
