@@ -12,7 +12,6 @@ from safetensors.torch import save_file
 from fragprune_plugins.errors import CheckpointError, OutputError
 from fragprune_plugins.learning.goals import Control, Fewer, Portable, Pressure
 from fragprune_plugins.learning.schedule import Schedule, Settings
-from fragprune_plugins.workbench.finetune import checkpoints as files
 from fragprune_plugins.workbench.finetune import resuming
 from fragprune_plugins.workbench.finetune.api import finetune
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
@@ -181,18 +180,18 @@ def foreign(path):
 
 
 def not_finite(path):
-    tensors, values = files.load(path)
+    tensors, values = resuming.read(path, "cpu")
     tensors["exp_avg.opacity"][3] = torch.nan
-    save_file(tensors, path, metadata={"format": files.FORMAT, "values": json.dumps(values)})
+    save_file(tensors, path, metadata={"format": resuming.FORMAT, "values": json.dumps(values)})
 
 
 def tensors(change):
     """Spoil a checkpoint by replacing some of its tensors; None drops one."""
 
     def spoil(path):
-        known, values = files.load(path)
+        known, values = resuming.read(path, "cpu")
         given = known | change(known)
-        files.save(path, {k: v for k, v in given.items() if v is not None}, values)
+        Checkpoints(path).save({k: v for k, v in given.items() if v is not None}, values)
 
     return spoil
 
@@ -201,10 +200,10 @@ def value(name, word):
     """Spoil a checkpoint by a value that is another one's, or none."""
 
     def spoil(path):
-        known, values = files.load(path)
+        known, values = resuming.read(path, "cpu")
         *outer, inner = name.split(".")
         (values[outer[0]] if outer else values)[inner] = word
-        files.save(path, known, values)
+        Checkpoints(path).save(known, values)
 
     return spoil
 
@@ -216,10 +215,6 @@ BROKEN = {
     "not a number": not_finite,
     "a part is missing": tensors(lambda _: {"model.opacity": None}),
     "other rows": tensors(lambda _: {"model.opacity": torch.zeros(3, 1)}),
-    "negative second moments": tensors(lambda known: {"exp_avg_sq": known["exp_avg_sq"] - 1}),
-    "and of the opacity": tensors(
-        lambda known: {"exp_avg_sq.opacity": known["exp_avg_sq.opacity"] - 1}
-    ),
     "fewer thresholds": tensors(
         lambda known: {key: known[key][:5] for key in ("logits", "exp_avg", "exp_avg_sq")}
     ),
@@ -229,7 +224,7 @@ BROKEN = {
     **{
         f"{name}: {word}": value(name, word)
         for name, word in [
-            *(("adam_step", -1), ("adam_step", []), ("seconds", -1), ("steps", "x"), ("steps", -1)),
+            *(("adam_step", []), ("seconds", []), ("steps", "x"), ("steps", -1)),
             *(("_open", None), ("_median", {}), ("_held", 3), ("pressure.observe", 3)),
         ]
     },
@@ -254,7 +249,7 @@ def test_a_full_disk_costs_the_checkpoint_and_not_the_fine_tuning(
     def full(*_, **__):
         raise OutputError("x", "cannot be written (No space left on device)", "a place", "Free it.")
 
-    monkeypatch.setattr(files, "save", full)
+    monkeypatch.setattr(resuming, "replacing", full)
     path = tmp_path / "out.fragprune-unfinished"
     result = run(model, dataset, Settings(iterations=4), path, tell=told.append)
     assert result.progress.steps == 4

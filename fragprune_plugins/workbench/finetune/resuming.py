@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import time
 from collections.abc import Callable, Iterable
@@ -12,31 +13,44 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 from torch import Tensor
 
 from fragprune_plugins.constants import VERSION
-from fragprune_plugins.errors import CheckpointError, OutputError
-from fragprune_plugins.files.atomic import digest
+from fragprune_plugins.errors import CheckpointError, OutputError, SidecarError
+from fragprune_plugins.files.atomic import digest, replacing
 from fragprune_plugins.files.model import Model
+from fragprune_plugins.files.reading import UntrustedFile, parse_json
 from fragprune_plugins.learning.events import StepStats
+from fragprune_plugins.learning.finite import not_finite
 from fragprune_plugins.learning.plain import numbers_of
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.hooks import schedule_for
 from fragprune_plugins.plugins.loading import installed
-from fragprune_plugins.workbench.finetune import checkpoints
-from fragprune_plugins.workbench.finetune.checkpoints import UNFIT
 from fragprune_plugins.workbench.finetune.loop import Training
 from fragprune_plugins.workbench.finetune.losses import code_for
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Photograph, Shot
 from fragprune_plugins.workbench.scenes.images import IMAGE_FILE
 
+FORMAT = "fragprune-checkpoint-1"
 SUFFIX = ".fragprune-unfinished"
 EVERY = 300.0
 """Seconds between two checkpoints."""
 
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 _OF_VIEWS = {"before", "after"}  # of stage 2's tensors; all others have a row for each Gaussian
+_UNFIT = (  # raised where the parts of a checkpoint do not fit what they are loaded into
+    *(KeyError, ValueError, TypeError, IndexError, RuntimeError, AttributeError, OverflowError),
+    SidecarError,
+)
+_FILE = UntrustedFile(
+    CheckpointError,
+    "unreadable",
+    f"a file of format {FORMAT}",
+    "Remove it, or begin anew with --again.",
+)
 
 
 def path_beside(out: Path) -> Path:
@@ -71,9 +85,21 @@ class Checkpoints:
         return self.seconds is not None and time.monotonic() - self._last >= self.seconds
 
     def save(self, tensors: dict[str, Tensor], values: dict[str, Any]) -> None:
-        """Write a checkpoint. Where that fails, the one before stays, and somebody is told."""
+        """Write a checkpoint durably in the place of the one before.
+
+        Where that fails, the one before stays, and somebody is told.
+
+        Args:
+            values: whatever JSON can hold; floats come back to the bit.
+        """
+        content = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+        metadata = {"format": FORMAT, "values": json.dumps(values)}
         try:
-            checkpoints.save(self.path, tensors, values)
+            with replacing(self.path, durable=True) as new:
+                try:
+                    save_file(content, new, metadata=metadata)
+                except SafetensorError as error:  # that is how it says that the disk is full
+                    raise OSError(str(error)) from error
         except OutputError as error:  # the fine-tuning is worth more than its checkpoint
             self.tell(f"no checkpoint was written. {error}")
         self._last = time.monotonic()
@@ -86,7 +112,7 @@ class Checkpoints:
         """
         if not self.path.exists():
             return {}, {}
-        tensors, values = checkpoints.load(self.path, device)
+        tensors, values = read(self.path, device)
         found = values.get("configuration", {})
         if differ := differences(found, asked):
             other = [name for name in differ if name != "schedule"] or differ  # settings make it
@@ -101,6 +127,19 @@ class Checkpoints:
     def clear(self) -> None:
         """Remove the file: the result is saved."""
         self.path.unlink(missing_ok=True)
+
+
+def read(path: Path, device: torch.device | str) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """The tensors and values of a checkpoint; raises CheckpointError if it cannot be read."""
+    with _FILE.reading(path) as reading, safe_open(reading.path, framework="pt") as file:
+        metadata = file.metadata()
+        if metadata["format"] != FORMAT:
+            raise ValueError(f"format {metadata['format'][:80]!r}")
+        # copies: views into the file may lie in memory where other bits are rounded
+        tensors = {key: file.get_tensor(key).clone().to(device) for key in file.keys()}  # noqa: SIM118
+        if wrong := not_finite({k: each for k, each in tensors.items() if k != "curves"}):
+            raise ValueError(f"NaN or infinity in {', '.join(wrong)}")
+        return tensors, dict(parse_json(metadata["values"]))
 
 
 class Keeper:
@@ -127,7 +166,7 @@ class Keeper:
             return
         try:
             _unpack(training, tensors, values)
-        except UNFIT as error:
+        except _UNFIT as error:
             raise CheckpointError(
                 str(checkpoints.path),
                 f"parts that do not fit together ({error})",
@@ -180,19 +219,16 @@ def _packed(training: Training) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def _unpack(training: Training, tensors: dict[str, Tensor], values: dict[str, Any]) -> None:
-    """Take over what ``_packed`` gave; raises one of ``UNFIT`` if it does not fit."""
+    """Take over what ``_packed`` gave; raises one of ``_UNFIT`` if it does not fit."""
     stage = training.stage
     for name in tensors.keys() - _OF_VIEWS - {"curves"}:
         tensors[name] = training.processes.own(tensors[name])
     stage.load_state_dict(tensors, values)
     if len(stage.store) != len(training.model):
         raise ValueError(f"{len(stage.store)} thresholds of {len(training.model)} Gaussians")
-    adam_step, seconds = values["adam_step"], values["seconds"]
-    if min(adam_step, seconds) < 0:
-        raise ValueError(f"{adam_step} steps in {seconds} seconds")
     for name, parameter in training.parameters().items():
         parameter.data.copy_(tensors[f"model.{name}"])
-        step = torch.tensor(float(adam_step), dtype=torch.float32)
+        step = torch.tensor(float(values["adam_step"]), dtype=torch.float32)
         state: dict[str, Tensor] = {"step": step}
         for moment in _MOMENTS:
             state[moment] = torch.empty_like(parameter).copy_(tensors[f"{moment}.{name}"])
@@ -202,7 +238,7 @@ def _unpack(training: Training, tensors: dict[str, Tensor], values: dict[str, An
     training.done = int(values["done"])
     if not 0 <= training.done == stage.steps <= training.settings.iterations:
         raise ValueError(f"{training.done} steps, of which the thresholds took {stage.steps}")
-    training.started -= seconds
+    training.started -= values["seconds"]
 
 
 def configuration(

@@ -20,8 +20,8 @@ from fragprune_plugins.hosts.preflight import missing_imports
 from fragprune_plugins.injection.starting import resumed_at
 from fragprune_plugins.workbench import finetune
 from fragprune_plugins.workbench.figures import records
-from fragprune_plugins.workbench.figures.recorded import recorded
-from fragprune_plugins.workbench.finetune import checkpoints
+from fragprune_plugins.workbench.figures.records import recorded
+from fragprune_plugins.workbench.finetune import resuming
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.report import work as report
 from fragprune_plugins.workbench.scenes import colmap
@@ -165,7 +165,7 @@ def _checkpoint(file: Path) -> None:
 
 
 def _progress(file: Path) -> None:
-    tensors, values = checkpoints.load(file)
+    tensors, values = resuming.read(file, "cpu")
     _sound("numbers that are not finite", all(map(_finite, tensors.values())))
     _sound("no values", isinstance(values, dict))
 

@@ -22,7 +22,7 @@ from plyfile import PlyData
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.workbench.figures import records
-from fragprune_plugins.workbench.finetune import checkpoints
+from fragprune_plugins.workbench.finetune.resuming import Checkpoints
 from fragprune_plugins.workbench.models import formats
 from fragprune_plugins.workbench.models.formats.ply import write_ply
 from fragprune_plugins.workbench.models.formats.spz import zstd
@@ -190,7 +190,7 @@ def _checkpoint(folder: Path) -> bytes:
 def _progress(folder: Path) -> bytes:
     path = folder / "progress.safetensors"
     tensors = {"logits": torch.zeros(3), "exp_avg_sq.logits": torch.ones(3)}
-    checkpoints.save(path, tensors, {"configuration": {"iterations": 3}, "step": 2})
+    Checkpoints(path).save(tensors, {"configuration": {"iterations": 3}, "step": 2})
     return path.read_bytes()
 
 
