@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -12,10 +12,8 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.types import RasterOutputs
 from fragprune_plugins.workbench.commands import opening
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.options import (
@@ -73,11 +71,24 @@ def render(
     if film and not orbit:
         named = filming.along(named, max(FRAMES, len(named)))
     with joined(device) if shard else nullcontext(Ranks()) as ranks:
-        drawing = _Drawing(whole, named, rasterizer, device, ranks, shard)
-        files = [out] if film else drawing.save(out)
+        candidate = Candidate(part_of(whole, ranks, device) if shard else whole)
+        drawer = ShardedEngine(rasterizer, ranks) if shard else rasterizer
+        fragments: dict[int, float] = {}
+
+        def draw(index: int) -> Tensor:
+            with torch.no_grad():
+                outputs = candidate.draw(drawer, named[index][1].to(device))
+            fragments[index] = float(outputs.fragments_per_pixel)
+            return outputs.image
+
+        files = [out]
         if film:
-            filming.write_mp4(out, drawing.film(), FPS)
-        everybody = ranks.gather(drawing.fragments)
+            bar = tqdm(range(len(named)), desc="filming", unit="frame", leave=None)
+            filming.write_mp4(out, map(draw, bar), FPS)
+        else:
+            files = [out / f"{stem}.png" for stem in stems([name for name, _ in named])]
+            _save(files, draw, ranks)
+        everybody = ranks.gather(fragments)
     if not ranks.first:
         return None
     drawn = {index: each[index] for each in everybody for index in each}  # some draw one twice
@@ -91,6 +102,15 @@ def render(
     }
     wrote = f"{out}, {len(drawn)} frames" if film else f"{len(files)} pictures to {out}"
     return _report(figures, wrote, [*drawn.values()])
+
+
+def _save(files: list[Path], draw: Callable[[int], Tensor], ranks: Ranks) -> None:
+    """Write a picture of each view, of several processes each its share."""
+    last, turns = len(files) - 1, -(-len(files) // ranks.size)
+    for index in ranks.share(range(turns * ranks.size)):
+        image = draw(min(index, last))  # shards draw together, as often as each other
+        if index <= last:
+            save_image(files[index], image)
 
 
 def _report(figures: dict[str, Any], wrote: str, fragments: list[float]) -> Report:
@@ -137,46 +157,3 @@ def _views(
         orbit = filming.orbit(whole, FRAMES, up)
         named = [(name, replace(view, background=background)) for name, view in orbit]
     return divided(named, scene.resolution)
-
-
-class _Drawing:
-    """Draws the views, of several processes each its share, and keeps the counts.
-
-    Attributes:
-        fragments: per pixel, by number of the view.
-    """
-
-    def __init__(
-        self,
-        whole: Model,
-        named: Named,
-        engine: Engine,
-        device: torch.device,
-        ranks: Ranks,
-        shard: bool,
-    ) -> None:
-        self.fragments: dict[int, float] = {}
-        self._named, self._device, self._ranks = named, device, ranks
-        self._candidate = Candidate(part_of(whole, ranks, device) if shard else whole)
-        self._engine = ShardedEngine(engine, ranks) if shard else engine
-
-    @torch.no_grad()
-    def draw(self, index: int) -> RasterOutputs:
-        view = self._named[index][1].to(self._device)
-        outputs = self._candidate.draw(self._engine, view)
-        self.fragments[index] = float(outputs.fragments_per_pixel)
-        return outputs
-
-    def film(self) -> Iterator[Tensor]:
-        bar = tqdm(range(len(self._named)), desc="filming", unit="frame", leave=None)
-        return (self.draw(index).image for index in bar)
-
-    def save(self, out: Path) -> list[Path]:
-        """Write a picture of each view; all their paths."""
-        files = [out / f"{stem}.png" for stem in stems([name for name, _ in self._named])]
-        last, turns = len(files) - 1, -(-len(files) // self._ranks.size)
-        for index in self._ranks.share(range(turns * self._ranks.size)):
-            outputs = self.draw(min(index, last))  # shards draw together, as often as each other
-            if index <= last:
-                save_image(files[index], outputs.image)
-        return files
