@@ -151,10 +151,8 @@ def write(form: Format, new: Path, model: Model) -> None:
         try:
             form.write(file, model.to("cpu"))
         except ValueError as error:
-            found, remedy = (
-                f"a {form.name} file, which cannot hold {error}",
-                "Choose another suffix.",
-            )
+            found = f"a {form.name} file, which cannot hold {error}"
+            remedy = "Choose another suffix."
             raise OutputError(new.name, found, "another format", remedy) from error
 
 

@@ -228,13 +228,9 @@ def _rounded(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def _packed_rotations(quaternions: npt.NDArray[Any]) -> Any:
-    xyzw = quaternions[:, [1, 2, 3, 0]]
-    largest = np.abs(xyzw).argmax(axis=1)
-    others = np.arange(4)[None] != largest[:, None]
-    negative = xyzw[np.arange(len(xyzw)), largest] < 0
-    three = xyzw[others].reshape(-1, 3)
+    largest, three = arrays.without_largest(quaternions[:, [1, 2, 3, 0]])
     sizes = np.floor(511 * (np.abs(three) / _SQRT_HALF) + np.float32(0.5)).astype(np.uint32)
-    signs = ((three < 0) ^ negative[:, None]).astype(np.uint32)
+    signs = np.signbit(three).astype(np.uint32)
     packed = largest.astype(np.uint32)
     for size, sign in zip(sizes.T, signs.T, strict=True):
         packed = packed << 10 | sign << 9 | size
