@@ -16,7 +16,7 @@ from fragprune_plugins.adapting import Photographs, read_ply
 from fragprune_plugins.plugins.loading import installed
 from fragprune_plugins.workbench.commands import opening
 from fragprune_plugins.workbench.commands.options import EngineOptions
-from fragprune_plugins.workbench.figures.recorded import Recorded
+from fragprune_plugins.workbench.figures.records import Recorded
 from fragprune_plugins.workbench.models.formats.ply import write_ply
 from fragprune_plugins.workbench.run.work import measure_models
 

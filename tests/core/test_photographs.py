@@ -10,7 +10,7 @@ from fragprune_graphdeco.adapter import resolution
 from fragprune_plugins.adapting import HostRepo, NotComparedError, Photographs, Resolution
 from fragprune_plugins.workbench.demo import work
 from fragprune_plugins.workbench.figures import records
-from fragprune_plugins.workbench.figures.recorded import Recorded, recorded
+from fragprune_plugins.workbench.figures.records import Recorded, recorded
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 HOST = HostRepo(Path(work.__file__).with_name("host"))

@@ -15,7 +15,7 @@ from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.workbench.bench.timing import describe_machine
 from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.figures.evaluate import Candidate
-from fragprune_plugins.workbench.figures.recorded import plain
+from fragprune_plugins.workbench.figures.records import plain
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.scenes.dataset import Dataset
 

@@ -21,7 +21,6 @@ from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOpt
 from fragprune_plugins.workbench.figures import records, wording
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
 from fragprune_plugins.workbench.figures.pictures import leave_panels
-from fragprune_plugins.workbench.figures.recorded import Recorded, plain, recorded
 from fragprune_plugins.workbench.models.model import load, writable_folder
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
 from fragprune_plugins.workbench.scenes.output import over_white, trained_on
@@ -87,7 +86,7 @@ def _figures(
         "engine": after["engine"],
         "device": before["device"],
         "enlarge": enlarge,
-        "scene": plain(photographs) if photographs else None,
+        "scene": records.plain(photographs) if photographs else None,
         "warnings": wording.nothing_drawn(drawn) + wording.unrelated(before, after),
     }
 
@@ -115,12 +114,12 @@ def _lines(
     ]
 
 
-def _records(*models: Path) -> dict[Path, Recorded]:
+def _records(*models: Path) -> dict[Path, records.Recorded]:
     """By model, what the record of the command that wrote it says, if there is one."""
-    known: dict[Path, Recorded] = {}
+    known: dict[Path, records.Recorded] = {}
     for model in models:
         record = records.beside(model)
-        if record and (read := recorded(record)):
+        if record and (read := records.recorded(record)):
             known[model] = read
             known |= {other: read for other in models if other.resolve() == read.models[0]}
     return known
@@ -132,7 +131,9 @@ def _recorded_cameras(scene: SceneOptions, *models: Path) -> OwnCameras | None:
     return next(filter(None, (own_cameras(record, scene) for record in written)), None)
 
 
-def _photographs(scene: SceneOptions, known: dict[Path, Recorded], *models: Path) -> Photographs:
+def _photographs(
+    scene: SceneOptions, known: dict[Path, records.Recorded], *models: Path
+) -> Photographs:
     """The photographs that the options name; else those of the records or of the trainings."""
     read = {each.photographs for each in known.values()}
     if not read and scene.data is None:

@@ -6,7 +6,7 @@ import contextlib
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,7 @@ import click
 
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.hosts.photographs import Photographs
-from fragprune_plugins.injection.launch import RunOptions, RunSummary, run
+from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.goals import Control
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hooks import engine_for
@@ -32,12 +32,10 @@ from fragprune_plugins.workbench.figures.evaluate import (
     frame_times,
     measure_all,
 )
-from fragprune_plugins.workbench.figures.recorded import Recorded
 from fragprune_plugins.workbench.figures.wording import begun, describe, frames, headlines, outcome
-from fragprune_plugins.workbench.finetune.trial import Trial
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.report import page as report_page
-from fragprune_plugins.workbench.run.work import Looking
+from fragprune_plugins.workbench.run.work import Looking, figures_of
 from fragprune_plugins.workbench.scenes.dataset import load_dataset
 
 HOST = Path(__file__).with_name("host") / "train.py"
@@ -133,99 +131,54 @@ def run_demo(
 
     Returns:
         The report. "before", "after" and "control" are measurements on held-out views; the control
-        learned for as many iterations without cutoffs. "seconds_by_part" are wall times.
+        learned for as many iterations without cutoffs. "seconds" is wall time.
 
     Raises:
         OutputError: the folder cannot be written, or holds files that no demo wrote.
     """
     clear(out)
-    seconds: dict[str, float] = {}
+    started = time.perf_counter()
     scene, model = out / "scene", out / "model"
     with claiming(out, "scene"):
         make_scene(scene, views=settings.views, width=settings.width, points=settings.points)
-    with (
-        _timed(seconds, "train"),
-        claiming(out, "model"),
-        contextlib.redirect_stdout(sys.stderr),
-    ):
-        command = host_command(scene.resolve(), model.resolve(), settings)
+    command = host_command(scene.resolve(), model.resolve(), settings)
+    learning = Settings(iterations=settings.finetune, seed=settings.seed)
+    at = EngineOptions(settings.engine, settings.device)
+    looking = Looking(at)
+    options = RunOptions(settings=learning, engine=at.name, device=at.device, look=looking)
+    with claiming(out, "model"), contextlib.redirect_stdout(sys.stderr):
         say(
             f"1/4  Training for {settings.iterations} iterations, then with a cutoff for "
             f"every Gaussian for {settings.finetune}"
         )
-        learning = Settings(iterations=settings.finetune, seed=settings.seed)
-        at = EngineOptions(settings.engine, settings.device)
-        looking = Looking(at)
-        options = RunOptions(settings=learning, engine=at.name, device=at.device, look=looking)
         summary = run(command, options)
-    assert summary.model_before is not None  # the host saves at its last iteration
-    assert summary.model_after is not None
-    pair = summary.model_before, summary.model_after
-    with _timed(seconds, "control"), claiming(out, "model"):
         say(f"2/4  The control: the same {settings.finetune} iterations without cutoffs")
-        zero = _control(command, options)
-    with _timed(seconds, "measure"):
-        say("3/4  Measuring on the held-out views")
-        loaded = (models.load(path, device=settings.device) for path in (*pair, zero))
-        candidates = [Candidate(each) for each in loaded]
-        report = _measure(scene, candidates, settings, summary, looking.trial)
-    with _timed(seconds, "pictures"), claiming(out, "pictures", "index.html", "model"):
-        say("4/4  Drawing the pictures")
+        without = replace(learning, goal=Control())
+        zero = run(command, replace(options, stage="finetune", settings=without, look=None))
+    saved = summary.model_before, summary.model_after, zero.model_after
+    paths = [path for path in saved if path is not None]  # all: the host saves at its last step
+    say("3/4  Measuring on the held-out views")
+    before, after, control = measure_all(
+        [Candidate(models.load(path, device=settings.device)) for path in paths],
+        load_dataset(scene).test,
+        engine=settings.engine,
+        repeats=_REPEATS,
+    )
+    report = figures_of(summary, learning, looking, before, after)
+    report |= {"control": control, "engine": after["engine"], "device": after["device"]}
+    say("4/4  Drawing the pictures")
+    with claiming(out, "pictures", "index.html", "model"):
         report["files"] = write_page(
             out, report, scene, summary.curves, settings.engine, settings.device
         )
-        read = Recorded(Photographs(scene), pair, filtered=True, drawing=summary.drawing)
+        pair = tuple(paths[:2])
+        read = records.Recorded(Photographs(scene), pair, filtered=True, drawing=summary.drawing)
         more = {"curves": summary.curves, "photographs": read.as_dict()}
-        records.leave(summary.model_after, "run", report | more)  # as of run, for report
-    report |= {"seconds_by_part": seconds, "seconds": sum(seconds.values())}
+        records.leave(pair[1], "run", report | more)  # as of run, for report
+    report["seconds"] = time.perf_counter() - started
     with claiming(out, REPORT), replacing(out / REPORT) as path:
         path.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     return report
-
-
-def _control(command: list[str], options: RunOptions) -> Path:
-    """The model that the host's stage 2 gives from the same checkpoint without cutoffs."""
-    settings = replace(options.settings, goal=Control())
-    with contextlib.redirect_stdout(sys.stderr):
-        summary = run(command, replace(options, stage="finetune", settings=settings, look=None))
-    assert summary.model_after is not None
-    return summary.model_after
-
-
-def _measure(
-    scene: Path,
-    candidates: list[Candidate],
-    settings: DemoSettings,
-    summary: RunSummary,
-    trial: Trial | None,
-) -> dict[str, Any]:
-    """Figures of the original, the pruned model and the control, on held-out views."""
-    shots = load_dataset(scene).test
-    before, after, zero = measure_all(candidates, shots, engine=settings.engine, repeats=_REPEATS)
-    return {
-        "before": before,
-        "after": after,
-        "control": zero,
-        "keep": trial and trial.keep,
-        "forgotten": trial and trial.forgotten,
-        "engine": after["engine"],
-        "device": after["device"],
-        "iterations": summary.steps,
-        "train_seconds": summary.train_seconds,
-        "adapter": summary.adapter,
-        "seed": settings.seed,
-        "model_before": str(summary.model_before),
-        "model_after": str(summary.model_after),
-        "settings": summary.settings,
-    }
-
-
-@contextlib.contextmanager
-def _timed(seconds: dict[str, float], part: str) -> Iterator[None]:
-    """Add the wall time of a block, as that of a part."""
-    started = time.perf_counter()
-    yield
-    seconds[part] = round(time.perf_counter() - started, 3)
 
 
 def write_page(

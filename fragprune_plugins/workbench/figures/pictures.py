@@ -135,20 +135,14 @@ def leave_panels(
     shots: Sequence[Shot],
     engine: Engine,
 ) -> str:
-    """Draw views into a folder, and leave a command's record there; returns a line that says so.
+    """Draw ``PANELS`` evenly spread views at most, and leave a command's record beside them.
 
-    The record is the report with ``files``, the names of the pictures, which is added.
+    A panel has the photograph, the renders, and the fragments on one scale. The record is the
+    report with ``files``, the names of the panels, which is added.
+
+    Returns:
+        A line that says so.
     """
-    files = draw_panels(out, columns, shots, engine)
-    report["files"] = [str(file) for file in files]
-    records.leave(out / command, command, report)
-    return f"Wrote {len(files)} pictures to {out}."
-
-
-def draw_panels(
-    out: Path, columns: dict[str, Candidate], shots: Sequence[Shot], engine: Engine
-) -> list[Path]:
-    """Draw ``PANELS`` evenly spread views at most: photograph, renders, fragments on one scale."""
     files = []
     chosen = evenly_spaced(shots, PANELS)
     for stem, shot in zip(stems([shot.name for shot in chosen]), chosen, strict=True):
@@ -162,4 +156,6 @@ def draw_panels(
             heat.append((f"{name}: {mean:.1f}/px", output.fragments))
         files.append(out / f"{stem}_panel.png")
         save_panel(files[-1], shown + heat, max(float(each.max()) for _, each in heat))
-    return files
+    report["files"] = [str(file) for file in files]
+    records.leave(out / command, command, report)
+    return f"Wrote {len(files)} pictures to {out}."

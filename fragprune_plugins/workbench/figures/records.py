@@ -6,14 +6,15 @@ import contextlib
 import json
 import math
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from fragprune_plugins.errors import RecordError
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.reading import MEBIBYTE, UntrustedFile, lies_in
+from fragprune_plugins.hosts.photographs import Photographs, Resolution
 
 SUFFIX = ".fragprune.json"
 FORMAT = "fragprune-record-1"
@@ -27,6 +28,9 @@ CONTROL = "control"
 
 _OF_CONTROLS = ("train", "opacity_lr", "seed", "views_per_step")
 _SAME_DB = 1e-3  # engines and machines differ by less in the PSNR of one model
+
+_NUMBERS = {"scale_modifier", "dilation", "near", "alpha_max"}
+"""Fields of ``RasterInputs`` that a record may set to a number."""
 
 
 @dataclass(frozen=True)
@@ -110,22 +114,32 @@ def portable(value: Any, folder: Path) -> Any:
     in the home folder; ``located`` finds it again. Inside other texts, ``folder`` is left out and
     the home folder becomes ``~``.
     """
-    if isinstance(value, dict):
-        return {key: portable(item, folder) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [portable(item, folder) for item in value]
-    if not isinstance(value, str):
-        return value
     homes, (near, base) = _spellings(Path.home()), _spellings(folder)
-    if os.path.isabs(value):
-        path = Path(os.path.normpath(value))
-        for home in homes:
-            if path.is_relative_to(home) and not Path(base).is_relative_to(home):
-                return str("~" / path.relative_to(home))
-        value = os.path.relpath(path, base)
-    for known, short in ((near, ""), (base, ""), *((home, "~" + os.sep) for home in homes)):
-        value = value.replace(known + os.sep, short)
-    return value
+    short = ((near, ""), (base, ""), *((home, "~" + os.sep) for home in homes))
+
+    def shortened(value: Any) -> Any:
+        if not isinstance(value, str):
+            return value
+        if os.path.isabs(value):
+            path = Path(os.path.normpath(value))
+            for home in homes:
+                if path.is_relative_to(home) and not Path(base).is_relative_to(home):
+                    return str("~" / path.relative_to(home))
+            value = os.path.relpath(path, base)
+        for known, instead in short:
+            value = value.replace(known + os.sep, instead)
+        return value
+
+    return _each(value, shortened)
+
+
+def _each(value: Any, change: Callable[[Any], Any]) -> Any:
+    """A plain value with every value in its dicts and lists changed."""
+    if isinstance(value, dict):
+        return {key: _each(item, change) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_each(item, change) for item in value]
+    return change(value)
 
 
 def located(text: str, folder: Path) -> Path:
@@ -136,6 +150,61 @@ def located(text: str, folder: Path) -> Path:
 def _spellings(path: str | Path) -> list[str]:
     """A folder's absolute path, as it is named and with its links followed."""
     return [os.path.abspath(path), os.path.realpath(path)]
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """The "photographs" of a record.
+
+    Attributes:
+        models: the model before and the model after; joint learning leaves the latter alone.
+        filtered: whether the models may be such as only their host's rules draw; see ``read_ply``.
+        drawing: fields of ``RasterInputs`` that differ from vanilla's rules.
+    """
+
+    photographs: Photographs
+    models: tuple[Path, ...]
+    filtered: bool = False
+    drawing: Mapping[str, Any] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, for ``recorded``."""
+        return plain(self.photographs) | {
+            "models": [str(model.resolve()) for model in self.models],
+            "filtered": self.filtered,
+            "drawing": dict(self.drawing),
+        }
+
+
+def plain(photographs: Photographs) -> dict[str, Any]:
+    """Plain values, for records."""
+    return asdict(photographs) | {"folder": str(photographs.folder.resolve())}
+
+
+def recorded(record: Record) -> Recorded | None:
+    """The photographs and models of a record; None if it names none.
+
+    Raises:
+        RecordError: they are of other types.
+    """
+    with RECORD_FILE.stated(record.path) as reading:
+        values = record.data.get("photographs")
+        if values is None:
+            return None
+        reading.place = "data.photographs"
+        folder = record.path.parent
+        models = tuple(located(each, folder) for each in values["models"])
+        if not 1 <= len(models) <= 2:
+            raise ValueError(f"{len(models)} models")
+        drawing = dict(values["drawing"])
+        for name, value in drawing.items():
+            number = isinstance(value, int | float) and 0 <= value < 1e6
+            if not (number if name in _NUMBERS else name == "compensation"):
+                raise ValueError(f"{name} is {value!r}")
+        filtered = bool(values["filtered"])
+        scene, size = located(values["folder"], folder), Resolution(**values["resolution"])
+        photographs = Photographs(scene, size, values["white_background"], values["images"])
+        return Recorded(photographs, models, filtered, drawing)
 
 
 def control_of(data: dict[str, Any], among: Sequence[Path]) -> dict[str, Any] | None:
@@ -192,10 +261,8 @@ def _read(path: Path) -> Record:
 
 def strict(value: Any) -> Any:
     """Replace NaN and infinity by null, because JSON has neither."""
-    if isinstance(value, dict):
-        return {key: strict(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [strict(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+
+    def known(value: Any) -> Any:
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    return _each(value, known)

@@ -16,7 +16,6 @@ from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
 from fragprune_plugins.workbench.figures import records, wording
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
-from fragprune_plugins.workbench.figures.recorded import Recorded
 from fragprune_plugins.workbench.finetune.loop import FinetuneResult
 from fragprune_plugins.workbench.finetune.searching import Bounded
 from fragprune_plugins.workbench.finetune.trial import DROPOUT, KEEP
@@ -107,7 +106,7 @@ class Finetuned:
         scene = None
         if photographs is not None:
             scene = photographs.folder
-            more["photographs"] = Recorded(photographs, (asked.model, asked.out)).as_dict()
+            more["photographs"] = records.Recorded(photographs, (asked.model, asked.out)).as_dict()
         records.leave(asked.out, "finetune", data | more)
         then = wording.next_steps(asked.out, asked.out.parent, scene)  # records name no folders
         return Report(data, f"{text}\n{then}", exit_code=130 if result.interrupted else 0)

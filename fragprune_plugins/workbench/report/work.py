@@ -23,8 +23,7 @@ from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.figures import records, wording
 from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.figures.page import Table, embedded
-from fragprune_plugins.workbench.figures.recorded import recorded
-from fragprune_plugins.workbench.figures.records import CONTROL, RECORD_FILE, Record
+from fragprune_plugins.workbench.figures.records import CONTROL, RECORD_FILE, Record, recorded
 from fragprune_plugins.workbench.goals import parse_goal
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.report import page as report_page

@@ -31,7 +31,6 @@ from fragprune_plugins.workbench.commands.opening import bound_threads, open_eng
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.figures import records, wording
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
-from fragprune_plugins.workbench.figures.recorded import Recorded
 from fragprune_plugins.workbench.finetune.trial import Trial, tried
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.pruning import kept
@@ -91,7 +90,7 @@ def run(
                     before = first[0] if first else None
             except FragpruneError as error:  # the trained model is saved already
                 not_compared = error
-    data = _figures(summary, settings, looking, before, after, not_compared)
+    data = figures_of(summary, settings, looking, before, after, not_compared)
     if summary.steps and summary.model_after:
         read = photographs and photographs.as_dict()
         more = {"curves": summary.curves, "photographs": read}
@@ -113,15 +112,15 @@ def _enough_memory() -> Iterator[None]:
         ) from error
 
 
-def _figures(
+def figures_of(
     summary: launch.RunSummary,
     settings: Settings,
     looking: Looking,
     before: dict[str, Any] | None,
     after: dict[str, Any] | None,
-    not_compared: FragpruneError | None,
+    not_compared: FragpruneError | None = None,
 ) -> dict[str, Any]:
-    """What --json prints."""
+    """What --json prints of a run, from its measurements on held-out views."""
     trial = looking.trial
     data: dict[str, Any] = {
         "adapter": summary.adapter,
@@ -164,15 +163,15 @@ def _text(path: Path | None) -> str | None:
     return None if path is None else str(path)
 
 
-def photographs_of(summary: launch.RunSummary) -> Recorded | None:
+def photographs_of(summary: launch.RunSummary) -> records.Recorded | None:
     """How to read the host's data and draw its models; None if they cannot be measured."""
     if not summary.photographs:
         return None
     left = tuple(path for path in (summary.model_before, summary.model_after) if path)
-    return Recorded(summary.photographs, left, filtered=True, drawing=summary.drawing)
+    return records.Recorded(summary.photographs, left, filtered=True, drawing=summary.drawing)
 
 
-def measure_models(read: Recorded, engine: EngineOptions) -> list[dict[str, Any]]:
+def measure_models(read: records.Recorded, engine: EngineOptions) -> list[dict[str, Any]]:
     """Measure the models on held-out views, on the host's device if an engine can draw there."""
     device = "cpu" if engine.device == "cpu" else "auto"
     rasterizer, where = open_engine(EngineOptions(engine.name, device))
