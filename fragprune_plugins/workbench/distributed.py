@@ -97,12 +97,14 @@ class ShardedEngine:
         parts["colors"] = torch.cat(
             [self._colors(splats, ids, at.view) for ids, at in zip(rows, views, strict=True)]
         )
-        to, by = self._counts(rows)
+        rank, to = self.ranks.rank, [len(ids) for ids in rows]  # how many each gets of this one
+        by = [counts[rank] for counts in self.ranks.gather(to)]  # and this one of each
+        self.sent += sum(to) - to[rank]
         received = self._exchange(parts, to, by)
         cut = received.pop("thresholds", None)
         drawn = Splats(**received)  # type: ignore[arg-type]
         outputs = self.engine.rasterize(replace(inputs, splats=drawn), cut)
-        own, before = rows[self.ranks.rank], by[: self.ranks.rank]
+        own, before = rows[rank], by[:rank]
         local = {
             name: each.new_zeros(len(splats)).index_copy(0, own, each[sum(before) :][: len(own)])
             for name in _PER_GAUSSIAN
@@ -157,12 +159,6 @@ class ShardedEngine:
         colors = slice_at(chosen, Moment(0.0, view.campos), engine=self.engine).colors
         assert colors is not None
         return colors
-
-    def _counts(self, rows: Sequence[Tensor]) -> tuple[list[int], list[int]]:
-        """How many Gaussians this process sends to each, and gets of each."""
-        to, rank = [len(ids) for ids in rows], self.ranks.rank
-        self.sent += sum(to) - to[rank]
-        return to, [counts[rank] for counts in self.ranks.gather(to)]
 
     def _exchange(
         self, parts: Mapping[str, Tensor], to: list[int], by: list[int]
@@ -295,7 +291,7 @@ class Shards(Processes):
     def _gradient(self, leaf: Tensor, total: Tensor) -> Tensor:
         return total.expand_as(leaf).clone() if leaf.grad is None else leaf.grad + total
 
-    def compare(self, tensors: Mapping[str, Tensor], step: int) -> None:
+    def stepped(self, learned: Mapping[str, Tensor], step: int, *, last: bool = False) -> None:
         """Do nothing: no two processes hold the same Gaussian."""
 
     def described(self, configuration: dict[str, Any]) -> dict[str, Any]:

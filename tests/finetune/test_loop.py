@@ -239,16 +239,17 @@ def test_a_target_time_that_no_threshold_reaches_is_refused_before_any_work(
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
-def test_calibration_meets_what_is_measured_through_a_prediction_that_errs(noise):
-    store, stream = ThresholdStore(4), random.Random(0)
+def test_calibration_meets_what_is_measured_through_a_prediction_that_errs(monkeypatch, noise):
+    store, stream, target = ThresholdStore(4), random.Random(0), faster.FrameTarget(1.6)
     store.open(torch.full((4,), 0.5))
 
     def predicted():
         return 1 / (1 - float(store.values.detach().mean()))
 
-    def measured():
+    def measured(views):
         return predicted() ** 0.5 * (1 + noise * (2 * stream.random() - 1))
 
-    reached = faster.calibrate_measured(store, predicted, measured, 1.6)
-    assert reached == pytest.approx(1.6, rel=0.01 + noise)
+    monkeypatch.setattr(target, "measure", measured)
+    target.meet(store, predicted, ())
+    assert target.met == pytest.approx(1.6, rel=0.01 + noise)
     assert predicted() ** 0.5 == pytest.approx(1.6, rel=0.01 + 2 * noise)

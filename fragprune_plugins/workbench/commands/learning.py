@@ -33,10 +33,6 @@ class _Stop(click.ParamType):  # type: ignore[type-arg] # generic in later relea
 
     name = "share"
 
-    def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str:
-        """As --help has it."""
-        return "SHARE|auto|off"
-
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float | str | None:
@@ -84,6 +80,7 @@ _OPTIONS = (
     click.option(
         "--stop",
         type=_Stop(),
+        metavar="SHARE|auto|off",
         default="auto",
         show_default=True,
         help="A pixel draws the fragment that leaves less than this share of its light, and ends "

@@ -69,10 +69,18 @@ class FrameTarget(Target):
             self.seen.add(ratio(), self.measure(views))
 
     def meet(self, store: ThresholdStore, ratio: Callable[[], float], views: Sequence[Any]) -> None:
-        """Shift all thresholds onto the target, by predictions that measurements correct."""
-        self.met = calibrate_measured(
-            store, ratio, lambda: self.measure(views), self.ratio, seen=self.seen
-        )
+        """Shift all thresholds onto the target, by predictions that measurements correct.
+
+        Args:
+            ratio: of fragments, before over after, with the store as it stands.
+        """
+        for _ in range(_MEASURED):
+            aim = self.ratio ** (1 / self.seen.slope(self.ratio))
+            fragments = calibrate(store, ratio, aim, tolerance=_NEAR / 4)
+            self.met = self.measure(views)
+            self.seen.add(fragments, self.met)
+            if abs(self.met / self.ratio - 1) <= _NEAR:
+                break
 
     def state(self) -> dict[str, Any]:
         """Plain values, for ``load_state``."""
@@ -107,37 +115,6 @@ class Ratios(list[tuple[float, float]]):
             return TIME_FOLLOWS
         products = sum(w * p * m for w, (p, m) in zip(weights, self, strict=True))
         return min(max(products / squares, 0.1), 1.5)
-
-
-def calibrate_measured(
-    store: ThresholdStore,
-    fragments: Callable[[], float],
-    measured: Callable[[], float],
-    target: float,
-    *,
-    seen: Ratios | None = None,
-) -> float:
-    """Shift all thresholds so that a measured ratio meets a target, through that of fragments.
-
-    Args:
-        store: the thresholds; changed in place.
-        fragments: before over after, with the store as it stands.
-        measured: of frame times, likewise.
-        target: of the measured ratio.
-        seen: what was measured before, to begin with; added to.
-
-    Returns:
-        The ratio measured last.
-    """
-    seen, reached = Ratios() if seen is None else seen, math.nan
-    for _ in range(_MEASURED):
-        aim = target ** (1 / seen.slope(target))
-        met = calibrate(store, fragments, aim, tolerance=_NEAR / 4)
-        reached = measured()
-        seen.add(met, reached)
-        if abs(reached / target - 1) <= _NEAR:
-            break
-    return reached
 
 
 @torch.no_grad()

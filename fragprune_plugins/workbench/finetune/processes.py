@@ -124,7 +124,8 @@ class Processes:
     def stepped(self, learned: Mapping[str, Tensor], step: int, *, last: bool = False) -> None:
         """Compare all that learns, from time to time; raises RanksError if processes differ."""
         if self.ranks.several and (last or step % _COMPARE == 0):
-            self.compare(learned, step)
+            known = {name: fingerprint(tensor) for name, tensor in learned.items()}
+            self.ranks.agree(known, f"fine-tuning, after step {step}")
 
     def keeps(self, due: bool) -> bool:
         """Whether it is time for a checkpoint after this step, as all decided in it."""
@@ -193,8 +194,3 @@ class Processes:
         self.ranks.sum(flat)
         pieces = flat.split_with_sizes([part.numel() for part in parts])
         return [piece.view_as(part) for piece, part in zip(pieces, parts, strict=True)]
-
-    def compare(self, tensors: Mapping[str, Tensor], step: int) -> None:
-        """Raise RanksError unless all processes hold the same bits."""
-        known = {name: fingerprint(tensor) for name, tensor in tensors.items()}
-        self.ranks.agree(known, f"fine-tuning, after step {step}")

@@ -254,14 +254,7 @@ class _Handler(BaseHTTPRequestHandler):
         super().__init__(*words)
 
     def do_GET(self) -> None:
-        """Answer with a file."""
-        self._answer(with_body=True)
-
-    def do_HEAD(self) -> None:
-        """Answer as to GET, without the file."""
-        self._answer(with_body=False)
-
-    def _answer(self, *, with_body: bool) -> None:
+        """Answer with a file; HEAD as GET, without the file."""
         port = self.connection.getsockname()[1]
         if self.headers.get("Host") not in (f"{HOST}:{port}", f"localhost:{port}"):
             # A page of another site that has its name point here may not read the model.
@@ -282,8 +275,10 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("X-Content-Type-Options", "nosniff")
         self.send_header("Cross-Origin-Resource-Policy", "same-origin")
         self.end_headers()
-        if with_body:
+        if self.command == "GET":
             self.wfile.write(content)
+
+    do_HEAD = do_GET  # noqa: N815 - the name that its base class looks for
 
     def log_message(self, *words: Any) -> None:
         """Say nothing: the terminal is the command's."""
