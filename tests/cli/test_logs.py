@@ -3,7 +3,6 @@
 import csv
 import io
 import logging
-import os
 import sys
 from types import SimpleNamespace
 
@@ -12,7 +11,6 @@ from cli.commands import fails, run, run_json
 from click.shell_completion import ShellComplete
 from finetune import tiny
 
-from fragprune_plugins.errors import OutputError
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.plugins.hookspecs import fragprune_step
 from fragprune_plugins.plugins.loading import Plugins, installed
@@ -169,12 +167,6 @@ def test_a_file_that_is_no_log_is_not_begun_anew(tmp_path):
     words = ("finetune", model, "--data", data, "--out", tmp_path / "p.ply", *WORDS)
     fails(*words, "--log", f"csv:{model}", says="a file that is no log", code=1)
     assert model.read_bytes() == before
-
-
-def test_a_pipe_that_nobody_reads_is_not_waited_for(tmp_path):
-    os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(OutputError, match="pipe"), logging_steps([CsvLog(str(tmp_path / "pipe"))]):
-        pass
 
 
 VALUES = {

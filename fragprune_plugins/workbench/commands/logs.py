@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import csv
 import functools
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, fields
 from importlib.metadata import EntryPoint
@@ -28,11 +27,6 @@ from fragprune_plugins.workbench.ranks import launched
 
 GROUP = "fragprune.logs"
 """The entry-point group of kinds of logs."""
-
-
-def _open(path: str, flags: int) -> int:
-    """Open a file without waiting for whoever reads a pipe."""
-    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0), 0o666)
 
 
 COLUMNS = tuple(each.name for each in fields(StepStats))
@@ -60,9 +54,7 @@ class CsvLog:
         try:
             if self._path.is_file() and not self._is_ours():
                 raise OSError("a file that is no log")
-            self._file = open(  # noqa: SIM115
-                self._path, "a", newline="", encoding="utf-8", opener=_open
-            )
+            self._file = open(self._path, "a", newline="", encoding="utf-8")  # noqa: SIM115
         except (OSError, ValueError) as error:  # ValueError: a NUL in the name
             why = getattr(error, "strerror", None) or str(error)
             raise OutputError(path, why, "a file for --log", "Choose another place.") from error

@@ -36,16 +36,13 @@ def export(
     if splat.pruned:
         formats.expect_carrier(form, out)
     dropped, lines, count = None, [], len(splat)
-    save(out, splat)
     if keep == "visible":
-        size, splat = out.stat().st_size, splat.keep(visible(splat))
-        save(out, splat)
-        gone, left = count - len(splat), out.stat().st_size
-        dropped = {"gaussians": gone, "of": count, "bytes_before": size, "bytes_after": left}
+        splat = splat.keep(visible(splat))
+        dropped = {"gaussians": count - len(splat), "of": count}
         lines.append(
-            f"Dropped {gone:,} of {count:,} Gaussians, too faint for any view: "
-            f"{size:,} -> {left:,} bytes."
+            f"Dropped {count - len(splat):,} of {count:,} Gaussians, too faint for any view."
         )
+    save(out, splat)
     truncated = splat.falloff is not None
     column = THRESHOLD_COLUMN if form.paired and truncated else None
     held = "cutoffs" if truncated else "no cutoffs"
