@@ -245,7 +245,7 @@ class _Survey:
             self._asked.setdefault(viewer.names, []).append(extents.shaded(engine, inputs, viewer))
         cut = self._itself.thresholds(inputs)
         if cut is not None:
-            reach = extents.honouring(cut, opacities)
+            reach = torch.minimum(-2 * cut.log(), 2 * (255 * opacities).log())
             self._asked.setdefault(HONOURING, []).append(extents.quads(engine, inputs, reach))
         if shown:
             assert itself.fragments is not None

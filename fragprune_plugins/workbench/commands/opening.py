@@ -73,8 +73,7 @@ def photographs_for(
         DatasetError: the training's arguments cannot be read.
     """
     if scene.data is not None:
-        size, white = Resolution(scene.resolution), over_white(model) or scene.white_background
-        return Photographs(scene.data, size, white, scene.images)
+        return overridden(Photographs(scene.data, white_background=over_white(model)), scene)
     trained = trained_on(model)
     if trained is None:
         raise UsageError(

@@ -136,8 +136,3 @@ def shaded(engine: Engine, inputs: RasterInputs, viewer: Viewer) -> float:
     tiles = (last - first).clamp_min(0).prod(1)
     pairs = float(torch.where(visible & (squared >= 0), tiles, 0.0).double().sum())
     return pairs * TILE * TILE / float(size.prod())
-
-
-def honouring(thresholds: Tensor, opacities: Tensor) -> Tensor:
-    """(N,) squared radii by thresholds and 1/255, as a viewer that knows both has them."""
-    return torch.minimum(-2 * thresholds.log(), 2 * (255 * opacities).log())

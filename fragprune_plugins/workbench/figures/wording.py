@@ -101,7 +101,8 @@ def tabulate(columns: Mapping[str, dict[str, Any]]) -> list[list[str]]:
             if key in _DIFFERENCES:
                 cells.append(f"{last - first:+.{digits}f}")
             elif key == "frame_ms":
-                cells.append(_fast(*reports[-2:]))
+                ratio, _, claimed = _faster(*reports[-2:])
+                cells.append(f"{ratio:.2f}x as fast" if claimed else "within noise")
             else:
                 cells.append(_less(first, last, "less" if key == "area_per_pixel" else "fewer"))
         rows.append([label, *cells])
@@ -355,12 +356,6 @@ def _less(before: float, after: float, word: str = "fewer") -> str:
     if not before or not after:
         return "more" if after else "none"
     return f"{before / after:.2f}x {word}" if before > after else f"{after / before:.2f}x more"
-
-
-def _fast(before: dict[str, Any], after: dict[str, Any]) -> str:
-    """The ratio of two frame times in words, if it exceeds the standard errors."""
-    ratio, _, claimed = _faster(before, after)
-    return f"{ratio:.2f}x as fast" if claimed else "within noise"
 
 
 def frames(before: dict[str, Any], after: dict[str, Any], enlarge: int = 1) -> str:

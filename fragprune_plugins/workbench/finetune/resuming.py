@@ -39,6 +39,7 @@ SUFFIX = ".fragprune-unfinished"
 EVERY = 300.0
 """Seconds between two checkpoints."""
 
+_DECIDING = (hookspecs.fragprune_truncate, hookspecs.fragprune_create_schedule)
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 _OF_VIEWS = {"before", "after"}  # of stage 2's tensors; all others have a row for each Gaussian
 _UNFIT = (  # raised where the parts of a checkpoint do not fit what they are loaded into
@@ -267,7 +268,7 @@ def configuration(
         "thresholds": _digest(known),
         "photographs": _digest(each for shot in shots for each in _of(shot)),
         "engine": engine,
-        "plugins": deciding(),
+        "plugins": sorted({name for hook in _DECIDING for name in installed().answering(hook)}),
         "schedule": described(schedule or schedule_for(settings)),
         "device": model.device.type,
         **settings.as_dict(),
@@ -282,13 +283,6 @@ def described(schedule: Schedule) -> dict[str, Any]:
         **numbers_of(schedule),
         "pressure": {"kind": type(pressure).__qualname__, **numbers_of(pressure)},
     }
-
-
-def deciding() -> list[str]:
-    """Names of the plugins that may decide about thresholds or about the schedule."""
-    plugins = installed()
-    hooks = (hookspecs.fragprune_truncate, hookspecs.fragprune_create_schedule)
-    return sorted({name for hook in hooks for name in plugins.answering(hook)})
 
 
 def differences(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
