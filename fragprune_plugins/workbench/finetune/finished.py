@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -70,23 +70,21 @@ class Finetuned:
     truncated: bool
     shards: int = 1
 
-    def measured(self, dataset: Dataset, engine: Engine) -> list[dict[str, Any]]:
-        """Figures on held-out views: before, after, without thresholds, and of the control.
-
-        The last two only where there are any.
-        """
+    def measured(self, dataset: Dataset, engine: Engine) -> dict[str, dict[str, Any]]:
+        """Figures on held-out views: before, after; untruncated and control where there are any."""
         result = self.result
         whole = result.progress.gaussians if self.shards > 1 else None
-        candidates = [self.start, Candidate(result.model, gaussians=whole)]
+        models = {"before": self.start, "after": Candidate(result.model, gaussians=whole)}
         if self.truncated:
-            candidates.append(Candidate(result.model.untruncated(), gaussians=whole))
+            models["untruncated"] = Candidate(result.model.untruncated(), gaussians=whole)
         if self.found is not None:
-            candidates.append(Candidate(self.found.control.model))
-        return measure_all(candidates, dataset.test, engine=engine)
+            models["control"] = Candidate(self.found.control.model)
+        figures = measure_all(list(models.values()), dataset.test, engine=engine)
+        return dict(zip(models, figures, strict=True))
 
     def report(
         self,
-        figures: Sequence[dict[str, Any]],
+        figures: Mapping[str, dict[str, Any]],
         photographs: Photographs | None,
         configuration: dict[str, Any],
     ) -> Report:
@@ -111,22 +109,19 @@ class Finetuned:
         then = wording.next_steps(asked.out, asked.out.parent, scene)  # records name no folders
         return Report(data, f"{text}\n{then}", exit_code=130 if result.interrupted else 0)
 
-    def _data(self, figures: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    def _data(self, figures: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
         """What the record and ``--json`` say, from figures as ``measured``."""
         asked, result, settings = self.asked, self.result, self.result.settings
-        before, after, *without = figures
-        control, done = None, result.progress
-        if self.found is not None:
-            longer = self.found.control.progress.steps > done.steps  # where that was interrupted
-            control = None if longer else without[-1]
-            del without[-1]
+        after, control, done = figures["after"], figures.get("control"), result.progress
+        if self.found is not None and self.found.control.progress.steps > done.steps:
+            control = None  # it trained longer: the result was interrupted
         data: dict[str, Any] = {
             "model": str(asked.model),
             "out": str(asked.out),
             "target": after["target"],
-            "before": before,
+            "before": figures["before"],
             "after": after,
-            "untruncated": without[0] if without else None,
+            "untruncated": figures.get("untruncated"),
             "self": asked.itself,
             "seen": not asked.itself and saw_all(asked.model),
             "keep": asked.keep,

@@ -174,7 +174,7 @@ def _learned(opened: _Opened, ranks: Ranks, lost: float | None) -> tuple[Finetun
     return over, engine
 
 
-def _report(opened: _Opened, over: Finetuned, measured: list[dict[str, Any]] | None) -> Report:
+def _report(opened: _Opened, over: Finetuned, measured: dict[str, Any] | None) -> Report:
     """Say what came of it; before that, measure it."""
     asked, result = opened.asked, over.result
     if result.terminated:  # after SIGTERM there is no time for measurements
