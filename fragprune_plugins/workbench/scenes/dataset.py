@@ -86,10 +86,12 @@ class PixelSlot:
 
 
 class Pictures:
-    """Pixels in slots; those that were not used for longest go when the room is full.
+    """Pixels in slots. What came while there was room stays; what does not fit is read at each use.
+
+    Views come in random orders, in which pixels that make room for others would come back too late.
 
     Args:
-        room: bytes to keep. One picture is kept, whatever its size.
+        room: bytes to keep.
     """
 
     def __init__(self, room: int) -> None:
@@ -103,18 +105,12 @@ class Pictures:
 
     def get(self, slot: PixelSlot, load: Callable[[], Tensor]) -> Tensor:
         """The slot's pixels, loaded if they are not there."""
-        known = self._held.pop(slot, None)
-        self._held[slot] = pixels = load() if known is None else known  # the last one in the order
+        known = self._held.get(slot)
         if known is None:
-            self._make_room()
-        return pixels
-
-    def _make_room(self) -> None:
-        size = self.size
-        *others, _ = list(self._held)
-        for slot in others:
-            if size > self.room:
-                size -= self._held.pop(slot).numel()
+            known = load()
+            if self.size + known.numel() <= self.room:
+                self._held[slot] = known
+        return known
 
 
 PICTURES = Pictures(ROOM)
