@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import torch
+import numpy as np
 
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import (
@@ -62,10 +62,8 @@ def profile(
         *(f"Warning: {each}" for each in warnings),
     ]
     if loaded.falloff is not None:
-        points = torch.tensor([0.05, 0.25, 0.5, 0.75, 0.95])
-        thresholds = loaded.falloff.cpu()
-        step = max(1, len(thresholds) // 100_000)
-        quantiles = torch.quantile(thresholds[::step], points).tolist()
+        points = (0.05, 0.25, 0.5, 0.75, 0.95)
+        quantiles = np.quantile(loaded.falloff.cpu().numpy(), points).tolist()
         report["threshold_quantiles"] = quantiles
         lines.append(
             "Cutoffs as falloffs, 1 at a Gaussian's centre, 0 far outside (5, 25, 50, 75, 95 %): "
