@@ -269,7 +269,7 @@ class ForkDialect(GraphdecoDialect):
 
         made = super().modules(draw)
         for package, names in self.fork.settings.items():
-            made[package] = stand_ins.rasterizer(package, names, self.sparse_adam, draw)
+            made[package] = stand_ins.rasterizer(package, names, draw)
         return {name: module for name, module in made.items() if name in self.names()}
 
 
@@ -373,7 +373,6 @@ class ForkAdapter(GraphdecoAdapter):
             package=next(iter(fork.outputs), self.package),
             settings=next(iter(fork.settings.values()), ()),
             outputs=2,
-            sparse_adam=bool(repo.mentions(["train", MODEL], ["SparseGaussianAdam"])),
             fork=fork,
         )
 

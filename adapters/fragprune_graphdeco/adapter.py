@@ -121,7 +121,6 @@ class GraphdecoDialect(Dialect):
     Attributes:
         settings: field names of GaussianRasterizationSettings, as this revision passes them.
         outputs: number of values that the host unpacks.
-        sparse_adam: the revision looks for SparseGaussianAdam in the package.
     """
 
     otherwise: ClassVar[str] = ""
@@ -132,7 +131,6 @@ class GraphdecoDialect(Dialect):
     package: str
     settings: tuple[str, ...]
     outputs: int
-    sparse_adam: bool = False
 
     @property
     def prover(self) -> Prover:
@@ -233,7 +231,7 @@ class GraphdecoDialect(Dialect):
         """Stand-ins for the rasterizer and simple_knn."""
         from fragprune_graphdeco import stand_ins
 
-        rasterizer = stand_ins.rasterizer(self.package, self.settings, self.sparse_adam, draw)
+        rasterizer = stand_ins.rasterizer(self.package, self.settings, draw)
         return {self.package: rasterizer, **stand_ins.simple_knn()}
 
 
@@ -380,7 +378,6 @@ class GraphdecoAdapter(ScriptAdapter):
             package=self.package,
             settings=call.settings if call else (),
             outputs=(call.outputs if call else None) or 2,
-            sparse_adam=bool(repo.mentions(["train", MODEL], ["SparseGaussianAdam"])),
         )
 
     def scripts_of(self, repo: HostRepo) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ same; our engine draws.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from inspect import Parameter, Signature
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -33,16 +33,15 @@ _SIGNATURE = Signature(
 def rasterizer(
     package: str,
     settings: tuple[str, ...],
-    sparse_adam: bool,
     draw: Callable[[HostCall], Any],
     also: tuple[str, ...] = (),
 ) -> ModuleType:
-    """The rasterizer package: settings, rasterizer, MCMC's relocation and, for late revisions, the
-    sparse Adam.
+    """The rasterizer package: settings, rasterizer and MCMC's relocation.
+
+    It has no SparseGaussianAdam, which hosts since October 2024 look for: they do without.
 
     Args:
         settings: field names of the settings tuple, in order.
-        sparse_adam: whether to offer SparseGaussianAdam.
         also: further methods of the rasterizer, called like ``forward``.
     """
     fields = [(name, Any) for name in settings]
@@ -76,13 +75,11 @@ def rasterizer(
     for name in ("forward", *also):
         setattr(GaussianRasterizer, name, entry(name))
 
-    also_sparse = {"SparseGaussianAdam": SparseGaussianAdam} if sparse_adam else {}
     return module(
         package,
         GaussianRasterizationSettings=settings_type,
         GaussianRasterizer=GaussianRasterizer,
         compute_relocation=compute_relocation,
-        **also_sparse,
     )
 
 
@@ -169,39 +166,3 @@ def fused_ssim() -> dict[str, ModuleType]:
         ).mean()
 
     return {"fused_ssim": module("fused_ssim", fused_ssim=similarity)}
-
-
-class SparseGaussianAdam(torch.optim.Adam):
-    """Adam on the rows a view shows; no bias correction (the accelerated rasterizer's optimizer).
-
-    Args:
-        params: param groups of one parameter each, every parameter with N rows.
-        eps: added to the root of the second moment.
-    """
-
-    def __init__(self, params: Iterable[Any], lr: float, eps: float) -> None:
-        super().__init__(params=params, lr=lr, eps=eps)
-
-    @torch.no_grad()
-    def step(self, visibility: Tensor, N: int) -> None:  # type: ignore[override]
-        """Update the visible rows.
-
-        Args:
-            visibility: (N,) bool.
-        """
-        rows = visibility.nonzero()[:, 0]
-        for group in self.param_groups:
-            (parameter,) = group["params"]
-            if parameter.grad is None:
-                continue
-            state = self.state[parameter]
-            if not state:
-                state["step"] = torch.tensor(0.0)
-                state["exp_avg"] = torch.zeros_like(parameter)
-                state["exp_avg_sq"] = torch.zeros_like(parameter)
-            beta1, beta2 = group["betas"]
-            grad = parameter.grad[rows]
-            first = beta1 * state["exp_avg"][rows] + (1 - beta1) * grad
-            second = beta2 * state["exp_avg_sq"][rows] + (1 - beta2) * grad.square()
-            state["exp_avg"][rows], state["exp_avg_sq"][rows] = first, second
-            parameter[rows] -= group["lr"] * first / (second.sqrt() + group["eps"])

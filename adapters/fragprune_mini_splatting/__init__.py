@@ -64,7 +64,7 @@ class MiniSplattingDialect(GraphdecoDialect):
         """Stand-ins for vanilla's packages and for the scoring rasterizer."""
         from fragprune_graphdeco import stand_ins
 
-        scoring = stand_ins.rasterizer(SCORING, self.settings, False, draw, also=("render_depth",))
+        scoring = stand_ins.rasterizer(SCORING, self.settings, draw, also=("render_depth",))
         return {**super().modules(draw), SCORING: scoring}
 
 

@@ -30,7 +30,6 @@ def test_each_public_state_is_recognised_and_its_dialect_read(tmp_path, state):
     assert dialect.outputs == (3 if "2024" in state else 2)
     assert dialect.settings[:12] == tuple(SETTINGS[: 11 if state == "mid-July 2023" else 12])
     assert ("antialiasing" in dialect.settings) == ("2024" in state)
-    assert dialect.sparse_adam == (state == "October 2024")
     assert adapter.command_line(repo).default_iterations == 12_345
     assert choose(repo, [adapter]) is adapter
 

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from fragprune_graphdeco import stand_ins
 from fragprune_graphdeco.stand_ins import (
-    SparseGaussianAdam,
     compute_relocation,
     mean_squared_neighbour_distance,
 )
@@ -35,33 +34,6 @@ def test_simple_knn_answers_under_both_its_names():
     assert modules["simple_knn"]._C is modules["simple_knn._C"]
     with pytest.raises(AttributeError):  # dunders included: torch's inspection asks for them
         modules["simple_knn._C"].__wrapped__  # noqa: B018
-
-
-@given(st.lists(st.lists(st.booleans(), min_size=4, max_size=4), min_size=1, max_size=6))
-def test_sparse_adam_moves_visible_rows_by_the_formula_without_bias_correction(visible):
-    generator = torch.Generator().manual_seed(1)
-    start = torch.randn(4, 2, generator=generator)
-    gradients = torch.randn(len(visible), 4, 2, generator=generator)
-    parameter = torch.nn.Parameter(start.clone())
-    untouched = torch.nn.Parameter(start.clone())
-    groups = [
-        {"params": [parameter], "lr": 0.1, "name": "a"},
-        {"params": [untouched], "lr": 0.1, "name": "b"},
-    ]
-    optimizer = SparseGaussianAdam(groups, lr=0.0, eps=1e-15)
-    for gradient, rows in zip(gradients, visible, strict=True):
-        parameter.grad = gradient.clone()
-        optimizer.step(torch.tensor(rows), 4)
-    for row in range(4):
-        for column in range(2):
-            x, m, v = start[row, column].item(), 0.0, 0.0
-            for gradient, rows in zip(gradients, visible, strict=True):
-                if rows[row]:
-                    g = gradient[row, column].item()
-                    m, v = 0.9 * m + 0.1 * g, 0.999 * v + 0.001 * g * g
-                    x -= 0.1 * m / (math.sqrt(v) + 1e-15)
-            assert parameter[row, column].item() == pytest.approx(x, rel=1e-4, abs=1e-5)
-    assert torch.equal(untouched, start)
 
 
 @given(st.floats(0.005, 0.999), st.integers(1, 50), st.floats(0.01, 10.0))
@@ -92,8 +64,8 @@ def test_one_gaussian_in_place_of_one_is_itself():
     torch.testing.assert_close(flat, scales.reshape(-1))
 
 
-def rasterizer(sparse_adam=False, draw=lambda call: call):
-    return stand_ins.rasterizer("a_package", ("bg", "viewmatrix", "debug"), sparse_adam, draw)
+def rasterizer(draw=lambda call: call):
+    return stand_ins.rasterizer("a_package", ("bg", "viewmatrix", "debug"), draw)
 
 
 def test_the_rasterizer_takes_positional_and_keyword_calls_alike():
@@ -113,12 +85,6 @@ def test_what_a_rasterizer_is_made_with_comes_with_every_call():
     settings = module.GaussianRasterizationSettings("background", "viewmatrix", False)
     call = module.GaussianRasterizer(settings, profile=True)(1, 2, 3)
     assert call["profile"] is True
-
-
-@pytest.mark.parametrize("sparse", [False, True])
-def test_sparse_adam_is_there_only_for_hosts_that_look_for_it(sparse):
-    """Its mere presence makes a late-2024 host call with separate bands."""
-    assert hasattr(rasterizer(sparse_adam=sparse), "SparseGaussianAdam") == sparse
 
 
 def test_visible_means_in_front_of_the_near_plane():

@@ -106,9 +106,7 @@ def skeleton(
             f"    {values} = rasterizer(means3D=1{given})\n"
             for function in functions
         ),
-        "train.py": "from gaussian_renderer import render\n"
-        + ("from a import SparseGaussianAdam\n" if state == "October 2024" else "")
-        + FLAGS,
+        "train.py": "from gaussian_renderer import render\n" + FLAGS,
     }
     for name, text in files.items():
         path = root / name
