@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from weakref import WeakKeyDictionary
@@ -41,6 +41,12 @@ _EMPTIES = re.compile(r"\brmtree\(\w+\.model_path")
 STATISTICS = {"oneupSHdegree", "add_densification_stats"}
 _MAKES = re.compile(r"__init__|capture\w*|(restore|create|load|init|set)_?\w*|\w*setup\w*")
 """Methods that make a model, before it is trained."""
+_PARAMETER = re.compile(
+    rf"(.+)\.({'|'.join(sorted(PARAMETERS))})(\.(?!grad\b|requires_grad\b)\w+|\[.*\])*"
+)
+"""A parameter of a model, or a part of it."""
+_IN_PLACE = re.compile(r".+\.(?!_|requires_grad)\w+_", re.DOTALL)
+"""A method that changes values in place."""
 _OF_MODELS = re.compile(r"^scene\.\w*model\w*$")
 _MODELS = re.compile(r"\b(gaussians?|pc|model)$")
 """What functions and scripts call a model that they are given."""
@@ -195,12 +201,12 @@ class Fork:
         found: dict[ast.AST, frozenset[str]] = {}
         if any("setattr(" in ast.unparse(self.tree(each)) for each in self.scripts):
             return found
-        for node in (node for tree in self.trees.values() for node in every(tree, ast.If)):
-            taken = reading.decided(self.repo, self.command, node.test)
-            options = reading.options_of(self.repo, self.command, node.test)
-            if taken is not None and made.isdisjoint(options):
-                skipped = node.orelse if taken else node.body
-                found |= {inner: options for each in skipped for inner in nodes(each)}
+        known = reading.as_options(self.repo, self.command)
+        for tree in self.trees.values():
+            skipped = reading.skipped(tree, known)
+            named = {each: reading.options_of(each, known) for each in {*skipped.values()}}
+            own = {node: named[test] for node, test in skipped.items()}
+            found |= {node: names for node, names in own.items() if made.isdisjoint(names)}
         return found
 
     @cached_property
@@ -319,7 +325,7 @@ def _check_script(fork: Fork, script: str) -> None:
     counted = [each for each in loops if "iterations" in ast.unparse(each.iter)]
     if any(each in nodes(outer)[1:] for each in counted for outer in loops):
         fork.refuse("script", script, "a training in a loop", "one training")
-    fork.one_run = fork.one_run or _not_resumed(fork.repo, script, tree)
+    fork.one_run = fork.one_run or next(_not_resumed(fork.repo, script, tree), "")
 
 
 def _size(repo: HostRepo, script: str) -> str:
@@ -333,8 +339,7 @@ def _size(repo: HostRepo, script: str) -> str:
         read = {each.id for size in sizes for each in every(size, ast.Name)}
         cameras = {each for each in parameters if _CAMERA.match(each)} | {*parameters[:1]}
         for call in (each for each in calls if getattr(each.func, "id", "") == name):
-            passed = dict(zip(parameters, call.args, strict=False))
-            passed |= {each.arg: each.value for each in call.keywords if each.arg}
+            passed = reading.passed(call, parameters)
             for parameter in sorted((passed.keys() & read) - cameras):
                 if not is_off(passed[parameter]):
                     return f"{parameter}={ast.unparse(passed[parameter])}"
@@ -345,11 +350,8 @@ def _rests(tree: ast.Module) -> str:
     """Where alone a script steps its model's optimizer, with which thresholds step; "" if to its
     end.
     """
-    models, parts = reading.owners(tree), dict[ast.AST, str]()
-    for node in every(tree, ast.If):
-        test = ast.unparse(node.test)
-        if re.search(r"\biteration\b(?!.*\biterations\b)", test):
-            parts |= {inner: test for part in (*node.body, *node.orelse) for inner in nodes(part)}
+    models = reading.owners(tree)
+    parts = _under(tree, r"\biteration\b(?!.*\biterations\b)", both=True)
     called = [n for n, name in _method_calls(tree) if name == "step"]
     steps = [n for n in called if ast.unparse(n.func).removesuffix(".optimizer.step") in models]
     return parts[steps[0]] if steps and parts.keys() >= {*steps} else ""
@@ -401,10 +403,7 @@ def _trainings(fork: Fork, module: str) -> tuple[str, str] | None:
 def _bound_at_first(tree: ast.Module) -> tuple[str, str] | None:
     """A name that a function binds only in its first iterations, and where; it reads it later."""
     for function in every(tree, ast.FunctionDef):
-        early = dict[ast.AST, str]()
-        for node in every(function, ast.If):
-            if re.fullmatch(r"iteration (<|<=|==) \d+", test := ast.unparse(node.test)):
-                early |= {inner: test for each in node.body for inner in nodes(each)}
+        early = _under(function, r"^iteration (<|<=|==) \d+$")
         bound = [(name, node) for node in nodes(function) for name in _binds(node)]
         first = {name: early[node] for name, node in bound if node in early}
         later = {name for name, node in bound if node not in early}
@@ -423,22 +422,24 @@ def _binds(node: ast.AST) -> list[str]:
     return [node.id] if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) else []
 
 
-def _not_resumed(repo: HostRepo, script: str, tree: ast.Module) -> str:
-    """Why a script cannot resume its own training, or we not read its checkpoints; "" if it can."""
-    missing = [name for name in ("capture", "restore") if name not in _mentioned(tree)]
-    missing += [name for name in ("capture", "restore") if name not in _methods(repo)]
+def _not_resumed(repo: HostRepo, script: str, tree: ast.Module) -> Iterator[str]:
+    """Why a script cannot resume its own training, or we not read its checkpoints."""
+    methods, text = _methods(repo), ast.unparse(tree)
+    both = ("capture", "restore")
+    missing = [name for each in (_mentioned(tree), methods) for name in both if name not in each]
     if missing:
-        return f"{script} has no {' and no '.join(dict.fromkeys(missing))}"
-    if _EMPTIES.search(ast.unparse(tree)):
-        return f"{script} removes its output folder"
-    if not _CHECKPOINT.search(ast.unparse(tree)):
-        return f"{script} has checkpoints of another name"
+        yield f"{script} has no {' and no '.join(dict.fromkeys(missing))}"
+        return
+    if _EMPTIES.search(text):
+        yield f"{script} removes its output folder"
+    if not _CHECKPOINT.search(text):
+        yield f"{script} has checkpoints of another name"
     saved = [node.args[0] for node, name in _method_calls(tree) if name == "save" and node.args]
     kept = [each for each in saved if "capture()" in ast.unparse(each)]
     if not any(isinstance(each, ast.Tuple) and len(each.elts) == 2 for each in kept):
-        return f"{script} has checkpoints that are not its model and the iteration"
+        yield f"{script} has checkpoints that are not its model and the iteration"
     if bound := _bound_at_first(tree):
-        return f"{script} makes {bound[0]} only where {bound[1]}"
+        yield f"{script} makes {bound[0]} only where {bound[1]}"
     made = every(tree, ast.Assign)
     assigned = [(node, ast.unparse(target)) for node in made for target in node.targets]
     read = {
@@ -448,26 +449,25 @@ def _not_resumed(repo: HostRepo, script: str, tree: ast.Module) -> str:
         for name in re.findall(r"\w+", names)
     }
     if any(node.lineno > read.get(name, node.lineno) for node, name in assigned):
-        return f"{script} does not go on at the iteration of its checkpoint"
-    capture = _methods(repo)["capture"]
-    if not any("optimizer.state_dict()" in ast.unparse(each) for each in _state(capture)):
-        return "its checkpoints have no state of an optimizer"
-    whole = re.findall(r"self\.(\w+)(?=[,)])", ast.unparse(capture))
-    taken, state = _taken_back(_methods(repo)["restore"]), _state(capture)
+        yield f"{script} does not go on at the iteration of its checkpoint"
+    capture = methods["capture"]
+    taken, state = _taken_back(methods["restore"]), _state(capture)
+    if not any("optimizer.state_dict()" in ast.unparse(each) for each in state):
+        yield "its checkpoints have no state of an optimizer"
     fixed = [each for each in state if not isinstance(each, ast.Starred)]
     more = len(state) - len(fixed)
     if taken and not any(n >= len(fixed) if more else n == len(fixed) for n in taken):
-        return f"its restore takes {taken[0]} values, and capture gives {len(state)}"
+        yield f"its restore takes {taken[0]} values, and capture gives {len(state)}"
+    whole = re.findall(r"self\.(\w+)(?=[,)])", ast.unparse(capture))
     trained = re.findall(r"self\.(\w+)\.parameters\(", ast.unparse(repo.tree(MODEL) or ast.Pass()))
     if networks := sorted({*whole} & {*trained}):
-        return f"its checkpoints hold whole networks, {', '.join(networks)}"
+        yield f"its checkpoints hold whole networks, {', '.join(networks)}"
     if networks := sorted({*trained} - _mentioned(capture)):
-        return f"its checkpoints lack networks, {', '.join(networks)}"
-    setup = ast.unparse(_methods(repo).get("training_setup", ast.Pass()))
+        yield f"its checkpoints lack networks, {', '.join(networks)}"
+    setup = ast.unparse(methods.get("training_setup", ast.Pass()))
     values = re.findall(r"'params': \[self\.(\w+)\]", setup)
     if lacking := sorted({*values} - _mentioned(capture)):
-        return f"its checkpoints lack {', '.join(lacking)}"
-    return ""
+        yield f"its checkpoints lack {', '.join(lacking)}"
 
 
 def rests_after_densification(fork: Fork) -> bool:
@@ -479,16 +479,22 @@ def rests_after_densification(fork: Fork) -> bool:
     )
 
 
-@lru_cache(maxsize=64)
-def _while_densifying(tree: ast.AST) -> set[ast.AST]:
+@lru_cache(maxsize=256)
+def _under(tree: ast.AST, pattern: str, both: bool = False) -> dict[ast.AST, str]:
+    """What is done only where a test of this pattern holds, with the test; or wherever it is asked
+    for.
+    """
+    found: dict[ast.AST, str] = {}
+    for node in every(tree, ast.If):
+        if re.search(pattern, test := ast.unparse(node.test)):
+            parts = (*node.body, *(node.orelse if both else ()))
+            found |= {inner: test for each in parts for inner in nodes(each)}
+    return found
+
+
+def _while_densifying(tree: ast.AST) -> Collection[ast.AST]:
     """What a script does only where it asks for ``densify_until_iter``."""
-    return {
-        inner
-        for node in every(tree, ast.If)
-        if "densify_until_iter" in ast.unparse(node.test)
-        for each in node.body
-        for inner in nodes(each)
-    }
+    return _under(tree, "densify_until_iter").keys()
 
 
 def _in_loop(tree: ast.AST, name: str) -> bool:
@@ -597,21 +603,13 @@ def _assigned(body: ast.AST, owner: str = "") -> Iterator[tuple[ast.AST, str]]:
             targets = node.targets
         elif isinstance(node, ast.AugAssign | ast.AnnAssign):
             targets = [node.target]
-        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
-            name = node.func.attr
-            if name.endswith("_") and not name.startswith(("_", "requires_grad")):
-                targets = [node.func.value]
+        elif isinstance(node, ast.Call) and _IN_PLACE.fullmatch(ast.unparse(node.func)):
+            targets = [node.func.value]  # type: ignore[attr-defined]
         for target in targets:
             for each in target.elts if isinstance(target, ast.Tuple) else [target]:
-                inner: ast.AST = each
-                while isinstance(inner, ast.Subscript | ast.Attribute):
-                    if getattr(inner, "attr", "") in ("grad", "requires_grad"):
-                        break
-                    if isinstance(inner, ast.Attribute) and inner.attr in PARAMETERS:
-                        if not owner or ast.unparse(inner.value) == owner:
-                            yield node, inner.attr
-                        break
-                    inner = inner.value
+                found = _PARAMETER.fullmatch(ast.unparse(each))
+                if found and owner in ("", found[1]):
+                    yield node, found[2]
 
 
 def _read_changes(fork: Fork) -> None:
@@ -812,11 +810,10 @@ def _stays_off(fork: Fork, function: str, value: ast.expr | None) -> bool:
     names = fork.repo.parameters(RENDERER, function) or ()
     if value.id not in off_by_default(body):
         return False
-    number = names.index(value.id) if value.id in names else len(names)
     calls = [node for tree in fork.trees.values() for node in every(tree, ast.Call)]
-    given = [key.value for node in calls for key in node.keywords if key.arg == value.id]
-    most = max((len(n.args) for n in calls if getattr(n.func, "id", "") == function), default=0)
-    return most <= number and all(_stays_off(fork, "", each) for each in given)
+    own = [getattr(each.func, "id", "") == function for each in calls]
+    given = [reading.passed(each, names if by else ()) for each, by in zip(calls, own, strict=True)]
+    return all(_stays_off(fork, "", each.get(value.id, ast.Constant(None))) for each in given)
 
 
 # -- outputs ---------------------------------------------------------------------------------------

@@ -19,11 +19,15 @@ from fragprune_graphdeco.call import ARGUMENTS, RASTERIZER, read_calls
 from fragprune_graphdeco.kernels import ORDER, SPLAT, read_kernels
 from fragprune_graphdeco.reading import (
     ACTIVATIONS,
+    Known,
     assigned,
+    decided,
     defaults,
     every,
     made_models,
+    passed,
     returns,
+    skipped,
 )
 from fragprune_plugins.adapting import (
     Function,
@@ -401,8 +405,7 @@ def _moved(repo: HostRepo, callers: HostRepo) -> Iterator[tuple[str, bool]]:
         names = (reading.module_of(each.relative_to(callers.root).as_posix()) for each in paths)
         calls = [call for each in names for call in callers.calls(each, function.name)]
         takes = [each.arg for each in function.args.args]
-        words = [(word.arg or "", word.value) for call in calls for word in call.keywords]
-        words += [pair for call in calls for pair in zip(takes, call.args, strict=False)]
+        words = [pair for call in calls for pair in passed(call, takes).items()]
         given = {name for name, value in words if not is_off(value)} & off_by_default(function)
         for why, kept in Drawing(repo, module, function, on=given).shapes() if given else ():
             if re.search(rf"from ([\w.]+, )*({'|'.join(sorted(given))}),", why):
@@ -416,14 +419,13 @@ def _drawing(repo: HostRepo, module: str) -> list[ast.FunctionDef]:
     return sorted(found, key=lambda each: (each.name != "render", not pictures(each)))
 
 
-def _call(function: ast.AST, off: Collection[str] = ()) -> ast.Call | None:
-    """The call that draws, of several one whose picture is returned, and that needs no argument
-    that is off.
+def _call(function: ast.AST, known: Known = lambda _: []) -> ast.Call | None:
+    """The call that draws, of several one whose picture is returned, and that is made by the values
+    that are known.
     """
-    needy = [node for node in every(function, ast.If) if _needs(node, off)]
-    behind = {inner for node in needy for each in node.body for inner in nodes(each)}
+    shown, gone = _shown(function), skipped(function, known)
     calls = [node for node in every(function, ast.Call) if "means3D" in arguments(node)]
-    order = {each: (each not in _shown(function), each in behind, each.lineno) for each in calls}
+    order = {each: (each not in shown, each in gone, each.lineno) for each in calls}
     return min(order, key=order.__getitem__, default=None)
 
 
@@ -431,12 +433,11 @@ def arguments(call: ast.AST | None) -> dict[str, ast.expr]:
     """The arguments of a call, by their names in a rasterizer of 3DGS."""
     if not isinstance(call, ast.Call):
         return {}
-    given = {each.arg: each.value for each in call.keywords if each.arg}
-    if ast.unparse(call.func).split(".")[-1] != "rasterization":
-        drawn = "opacities" in given or _RASTERIZER.fullmatch(ast.unparse(call.func))
-        return given | (dict(zip(ARGUMENTS, call.args, strict=False)) if drawn else {})
-    given |= dict(zip(_GSPLAT, call.args, strict=False))
-    return {_GSPLAT.get(name, name): value for name, value in given.items()}
+    given = passed(call, ())
+    if ast.unparse(call.func).split(".")[-1] == "rasterization":
+        return {_GSPLAT.get(name, name): value for name, value in passed(call, _GSPLAT).items()}
+    drawn = "opacities" in given or _RASTERIZER.fullmatch(ast.unparse(call.func))
+    return passed(call, ARGUMENTS) if drawn else given
 
 
 def pictures(function: ast.AST) -> list[ast.expr]:
@@ -459,17 +460,9 @@ def _shown(function: ast.AST) -> list[ast.AST]:
     return found
 
 
-def _needs(node: ast.If, off: Collection[str]) -> bool:
-    """Whether a branch is taken only if one of these arguments is given."""
-    both = isinstance(node.test, ast.BoolOp) and isinstance(node.test.op, ast.And)
-    tests = map(ast.unparse, node.test.values if both else [node.test])  # type: ignore[attr-defined]
-    given = re.compile(rf"({'|'.join(sorted(off)) or '-'})( is not None)?")
-    return any(map(given.fullmatch, tests))
-
-
-def _never_set(repo: HostRepo, test: str) -> bool:
-    """Whether a test asks for an attribute that may be missing, and that no file sets."""
-    asked = re.fullmatch(r"getattr\(\w+, '(\w+)', None\)( is not None)?", test)
+def _never_set(repo: HostRepo, value: str) -> bool:
+    """Whether a value is an attribute that may be missing, and that no file sets."""
+    asked = re.fullmatch(r"getattr\(\w+, '(\w+)', None\)", value)
     if asked is None:
         return False
     model = (repo.read(each) for each in (repo.root / "scene").glob("*.py"))
@@ -514,13 +507,18 @@ class Drawing:
         read = (n for n in every(function, ast.Attribute) if n.attr.startswith("get_xyz"))
         models = [each.value.id for each in read if isinstance(each.value, ast.Name)]
         self.model = models[0] if models else "pc"
-        self.call = call or _call(function, self.off)
+        self.call = call or _call(function, self._known)
         self.colours = set[str]()
         named = (*self.parameters, self.model)
         self.made: dict[str, tuple[str, ...]] = {each: (each,) for each in named}
         self.drawn = self.made
         self._collect(function.body)
         self.made = self.drawn
+
+    def _known(self, node: ast.AST) -> list[None]:
+        """None for arguments that are off, and for attributes that nobody sets."""
+        off = isinstance(node, ast.Name) and node.id in self.off
+        return [None] if off or _never_set(self.repo, ast.unparse(node)) else []
 
     def _collect(self, body: list[ast.stmt]) -> None:
         """Note what every name is made of, except where an argument is needed that is off."""
@@ -529,15 +527,13 @@ class Drawing:
                 self.drawn = self.made
             before = self.made
             if isinstance(node, ast.If):
-                test = ast.unparse(node.test)
-                on = self._is_colour_option(node) or _needs(node, self.off)
-                on = on or _never_set(self.repo, test)
-                none = any(re.fullmatch(rf"{each} is None|not {each}", test) for each in self.off)
-                self._collect([] if on else node.body)
-                if not none:
+                coloured = self._is_colour_option(node)
+                taken = False if coloured else decided(node.test, self._known)
+                self._collect([] if taken is False else node.body)
+                if not taken:
                     then, self.made = self.made, before
                     self._collect(node.orelse)
-                    self._join({} if on else then)
+                    self._join({} if taken is False else then)
             elif isinstance(node, ast.Assign):
                 for target in node.targets:
                     self._assign(target, node.value)

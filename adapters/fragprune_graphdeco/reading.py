@@ -7,7 +7,7 @@ import contextlib
 import operator
 import re
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -50,11 +50,12 @@ def read_getters(repo: HostRepo, module: str, unset: Collection[str] = ()) -> li
     for kind in GETTERS if repo.tree(module) else ():  # if not, the seams say so
         name = f"GaussianModel.get_{kind}"
         function, read = repo.function(module, name), kind in ("xyz", "opacity")
+        decorators = function.decorator_list if function else []
         if kind in computed:
             made = (each.value for each in every(function, ast.Return))
             ends = " or ".join(ast.unparse(each) for each in made if each)
             what = f"get_{kind} is computed, it returns {ends[:60] or 'nothing'}"
-        elif read and not (function and is_property(function)):
+        elif read and not any("property" in ast.unparse(each) for each in decorators):
             what = "a method" if function else "no such property"
         else:
             continue
@@ -115,6 +116,12 @@ def entries(tree: ast.AST | None, name: str) -> list[ast.expr]:
     return [value for key, value in pairs if getattr(key, "value", "") == name]
 
 
+def passed(call: ast.Call, names: Iterable[str]) -> dict[str, ast.expr]:
+    """The values of a call by the names of what it calls takes, in order."""
+    named = {each.arg: each.value for each in call.keywords if each.arg}
+    return dict(zip(names, call.args, strict=False)) | named
+
+
 def made_models(repo: HostRepo, module: str) -> list[str]:
     """Classes of models that a script makes, by their names, once for each place."""
     names = [getattr(each.func, "id", "") for each in every(repo.tree(module), ast.Call)]
@@ -135,7 +142,8 @@ def failing(repo: HostRepo, scripts: Collection[str]) -> list[str]:
         if isinstance(node, ast.Import | ast.ImportFrom)
         for name in repo.imported_by(module, node)[:1]
         for path in [repo.at(module, node.lineno)]
-        if _ELSEWHERE.fullmatch(name) and not _there(repo, name.split(".")[0])
+        for top in [name.split(".")[0]]
+        if _ELSEWHERE.fullmatch(name) and not (repo.path(top) or (repo.root / top).is_dir())
     ][:1]
     for script in scripts:
         tree, home = repo.tree(module_of(script)), home_of(repo, module_of(script))
@@ -173,18 +181,21 @@ def _misfits(repo: HostRepo, module: str) -> tuple[str, ...]:
     given or asked for.
     """
     tree, misfits = repo.tree(module), tuple[str, ...]()
-    asked = (each for each in every(tree, ast.If) if "hasattr(" in ast.unparse(each.test))
-    parts = [node.body for node in every(tree, ast.If) if isinstance(node.test, ast.Name)]
-    parts += [node.body for node in asked]
-    parts += [node.body for node in every(tree, ast.Try)]
-    tried = {inner for part in parts for each in part for inner in nodes(each)}
+    asked = [
+        each
+        for each in every(tree, ast.If)
+        if isinstance(each.test, ast.Name) or "hasattr(" in ast.unparse(each.test)
+    ]
+    parts = (each for node in (*asked, *every(tree, ast.Try)) for each in node.body)
+    tried = {inner for each in parts for inner in nodes(each)}
     model = _definition(repo, MODEL, "GaussianModel")[1]
     pairs = [(ast.unparse(to), ast.unparse(value)) for to, value in assigned(tree)]
     models = {to for to, value in pairs if value.startswith("GaussianModel(")}
     models -= {to for to, value in pairs if not value.startswith("GaussianModel(")}
-    reached = by_default(repo, ("arguments", module), tree) if tree else ()
+    gone = tried | skipped(tree, as_options(repo, ("arguments", module))).keys()
     texts = ast.unparse(tree or ast.Pass()) + ast.unparse(model or ast.Pass())
-    for node in (each for each in reached if isinstance(each, ast.Call) and each not in tried):
+    calls = [each for each in every(tree, ast.Call) if each not in gone]
+    for node in sorted(calls, key=lambda each: (each.lineno, each.col_offset)):
         owner, _, name = ast.unparse(node.func).rpartition(".")
         found, at = None, repo.at(module, node.lineno)
         if name in ("capture", "restore"):
@@ -229,7 +240,8 @@ def _absent(repo: HostRepo, module: str) -> tuple[str, ...]:
         said.setdefault(ast.unparse(to), set()).update(_given(repo, name) or {_ANY})
     for node in every(tree, ast.Call):  # what a script adds by another way than an item
         said.setdefault(ast.unparse(node.func).removesuffix(".update"), set()).add(_ANY)
-    items = [n for n in by_default(repo, ("arguments", module), tree or ast.Pass()) if _key(n)]
+    gone = skipped(tree, as_options(repo, ("arguments", module)))
+    items = [each for each in nodes(tree) if each not in gone and _key(each)]
     own = {_key(each) for each in items if isinstance(getattr(each, "ctx", None), ast.Store)}
     for each in (each for each in items if isinstance(each, ast.Subscript)):
         known = said.get(ast.unparse(each.value), {_ANY}) | own
@@ -317,48 +329,52 @@ _COMPARED = {
 }
 
 
-def by_default(repo: HostRepo, modules: Collection[str], node: ast.AST) -> Iterator[ast.AST]:
-    """A script without the branches that it does not take where options have their defaults."""
-    yield node
-    taken = decided(repo, modules, node.test) if isinstance(node, ast.If) else None
-    for name, value in ast.iter_fields(node):
-        if taken is not None and name == ("orelse" if taken else "body"):
-            continue
-        for each in value if isinstance(value, list) else [value]:
-            if isinstance(each, ast.AST):
-                yield from by_default(repo, modules, each)
+Known = Callable[[ast.AST], list[Any]]
+"""The one value of an expression; [] if it is not known."""
 
 
-def decided(repo: HostRepo, modules: Collection[str], test: ast.expr) -> bool | None:
-    """What a test says where options have the defaults that modules give them; None if it asks for
-    anything else.
-    """
+def skipped(tree: ast.AST | None, known: Known) -> dict[ast.AST, ast.expr]:
+    """What code does not do by the values that are known: nodes, with the test before each."""
+    found: dict[ast.AST, ast.expr] = {}
+    for node in every(tree, ast.If, ast.IfExp):
+        taken = decided(node.test, known)
+        branch: Any = None if taken is None else node.orelse if taken else node.body
+        for each in branch if isinstance(branch, list) else [branch]:
+            found |= dict.fromkeys(nodes(each), node.test)
+    return found
+
+
+def decided(test: ast.expr, known: Known) -> bool | None:
+    """What a test says by the values that are known; None if it asks for anything else."""
     if isinstance(test, ast.BoolOp):
-        parts = [decided(repo, modules, each) for each in test.values]
+        parts = [decided(each, known) for each in test.values]
         ends = isinstance(test.op, ast.Or)
         return ends if ends in parts else None if None in parts else not ends
     if isinstance(test, ast.UnaryOp) and isinstance(test.op, ast.Not):
-        inner = decided(repo, modules, test.operand)
+        inner = decided(test.operand, known)
         return None if inner is None else not inner
-    compared = isinstance(test, ast.Compare) and _COMPARED.get(type(test.ops[0]))
     sides = [test.left, *test.comparators] if isinstance(test, ast.Compare) else [test]
-    values = [_by_itself(repo, modules, each) for each in sides]
-    if not all(values) or not any(map(_option, sides)):
+    values = [known(each) or _one([each]) for each in sides]
+    if not all(values) or not any(map(known, sides)):
         return None
-    if len(sides) == 1:
+    if not isinstance(test, ast.Compare):
         return bool(values[0][0])
+    compared = _COMPARED.get(type(test.ops[0]))
     with contextlib.suppress(TypeError):
         return bool(compared(values[0][0], values[1][0])) if compared and len(sides) == 2 else None
     return None
 
 
-def options_of(repo: HostRepo, modules: Collection[str], test: ast.expr) -> frozenset[str]:
+def as_options(repo: HostRepo, modules: Collection[str]) -> Known:
+    """The values that modules give options by default."""
+    return lambda node: by_default_of(repo, modules, option) if (option := _option(node)) else []
+
+
+def options_of(test: ast.expr, known: Known) -> frozenset[str]:
     """The options that decide a test: those that are off by default, or else all."""
-    known = {
-        _option(each): _by_itself(repo, modules, each) for each in nodes(test) if _option(each)
-    }
-    off = [name for name, value in known.items() if value and not value[0]]
-    return frozenset(off or (name for name, value in known.items() if value))
+    values = {_option(each): known(each) for each in nodes(test) if _option(each)}
+    off = [name for name, value in values.items() if value and not value[0]]
+    return frozenset(off or (name for name, value in values.items() if value))
 
 
 def _option(node: ast.AST) -> str:
@@ -366,12 +382,6 @@ def _option(node: ast.AST) -> str:
     if isinstance(node, ast.Call) and ast.unparse(node.func) == "getattr":
         return str(getattr(node.args[1], "value", "")) if len(node.args) > 1 else ""
     return node.attr if isinstance(node, ast.Attribute) else ""
-
-
-def _by_itself(repo: HostRepo, modules: Collection[str], node: ast.AST) -> list[Any]:
-    """The one value of a constant, or of an option by default; [] if it is not known."""
-    option = _option(node)
-    return by_default_of(repo, modules, option) if option else _one([node])
 
 
 def by_default_of(repo: HostRepo, modules: Collection[str], option: str) -> list[Any]:
@@ -393,16 +403,6 @@ def module_of(script: str) -> str:
     return script.removesuffix(".py").replace("/", ".")
 
 
-def _there(repo: HostRepo, name: str) -> bool:
-    """Whether a checkout has a module or a folder of this name."""
-    return repo.path(name) is not None or (repo.root / name).is_dir()
-
-
-def is_property(function: Function) -> bool:
-    """Whether a method is read without a call."""
-    return any("property" in ast.unparse(each) for each in function.decorator_list)
-
-
 def returns(getter: Function, stored: str, unset: Collection[str] = ()) -> set[str]:
     """What a getter returns: "stored" and "activated" rows of an attribute, or "computed" values.
 
@@ -411,38 +411,31 @@ def returns(getter: Function, stored: str, unset: Collection[str] = ()) -> set[s
     activation = f"{stored[1:]}_activation"
     activations = (f"self.{activation}", *ACTIVATIONS.get(activation, ()))
     shapes = _SHAPES if stored != "_xyz" else set()
-    known: dict[str, str] = {}
+    made: dict[str, str] = {}
+
+    def known(node: ast.AST) -> list[None]:
+        return [None] if ast.unparse(node).removeprefix("self.") in unset else []
 
     def state(value: ast.expr | None) -> str:
-        if isinstance(value, ast.IfExp) and (gone := _skipped(value, unset)):
-            return state(value.orelse if value.body in gone else value.body)
+        if isinstance(value, ast.IfExp) and (taken := decided(value.test, known)) is not None:
+            return state(value.body if taken else value.orelse)
         while isinstance(value, ast.Call) and getattr(value.func, "attr", "") in shapes:
             value = value.func.value  # type: ignore[attr-defined]
         if isinstance(value, ast.Call) and len(value.args) == 1 and not value.keywords:
             stands = ast.unparse(value.func) in activations and state(value.args[0]) == "stored"
             return "activated" if stands else "computed"
         if isinstance(value, ast.Name):
-            return known.get(value.id, "computed")
+            return made.get(value.id, "computed")
         return "stored" if value and ast.unparse(value) == f"self.{stored}" else "computed"
 
-    gone = (each for node in every(getter, ast.If) for each in _skipped(node, unset))
-    skipped = {id(inner) for each in gone for inner in nodes(each)}
+    gone = skipped(getter, known)
     for statement in getter.body:
-        for node in (each for each in nodes(statement) if id(each) not in skipped):
+        for node in (each for each in nodes(statement) if each not in gone):
             if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
-                name, made = node.targets[0].id, state(node.value)
-                branch = node is not statement and name in known  # one of several
-                known[name] = "computed" if branch and made != known[name] else made
-    return {state(n.value) for n in every(getter, ast.Return) if id(n) not in skipped}
-
-
-def _skipped(node: ast.If | ast.IfExp, unset: Collection[str]) -> list[ast.AST]:
-    """The branch that is not taken where attributes are None or False; [] if that is not read."""
-    asked = re.fullmatch(r"(not )?self\.([\w.]+)( is not None)?", ast.unparse(node.test))
-    if asked is None or asked[2] not in unset:
-        return []
-    branch = node.orelse if asked[1] else node.body
-    return [*branch] if isinstance(branch, list) else [branch]
+                name, new = node.targets[0].id, state(node.value)
+                branch = node is not statement and name in made  # one of several
+                made[name] = "computed" if branch and new != made[name] else new
+    return {state(each.value) for each in every(getter, ast.Return) if each not in gone}
 
 
 def options(repo: HostRepo, module: str, model: str, scripts: Iterable[str]) -> set[str]:
