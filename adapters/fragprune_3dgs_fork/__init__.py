@@ -340,15 +340,12 @@ class ForkAdapter(GraphdecoAdapter):
             named = (repo.parameters(MODEL, f"{CLASS}.{method}") or ())[:1]
             return Seam(role, MODEL, f"{CLASS}.{method}", named, how=how)
 
+        rate, noise = "update_learning_rate", graphdeco.no_noise if fork.noisy else None
         setups = dict.fromkeys(["training_setup", *fork.setups])
         return (
             Seam(Role.SCENE, "scene", "Scene.__init__"),
             *(of(Role.ATTACH, name, graphdeco.optimizers) for name in setups),
-            *(
-                of(Role.STEP, name, graphdeco.no_noise if fork.noisy else None)
-                for name in ("update_learning_rate",)
-                if fork.defines(name)
-            ),
+            *([of(Role.STEP, rate, noise)] if repo.function(MODEL, f"{CLASS}.{rate}") else []),
             of(Role.KEEP, "_prune_optimizer"),
             of(Role.APPEND, "cat_tensors_to_optimizer"),
             *(

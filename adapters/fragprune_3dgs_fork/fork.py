@@ -130,10 +130,6 @@ class Fork:
         if all(each.found != found for each in self.findings):
             self.findings.append(Finding("warning", code, where, found))
 
-    def defines(self, method: str) -> bool:
-        """Whether the model has a method of this name."""
-        return method in _methods(self.repo)
-
     @property
     def options_in(self) -> tuple[str, ...]:
         """The modules that give options and attributes of the model their defaults."""

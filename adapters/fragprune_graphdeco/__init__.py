@@ -9,6 +9,7 @@ plain         whether the PLY that a codebase saves is plain 3DGS
 proof         proves their rasterizers: it draws by both, and ``likeness`` compares
 stand_ins     modules of ours for their compiled packages
 
+Every name here is imported as itself: that is how Python says that a module passes it on.
 Importing this package imports no torch; ``proof``, ``likeness`` and ``stand_ins`` do.
 """
 
@@ -16,50 +17,30 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from fragprune_graphdeco.adapter import (
-    CLONE,
-    MODEL,
-    SPLIT,
-    GraphdecoAdapter,
-    GraphdecoDialect,
-    default,
-    group_names,
-    model_seam,
-    no_noise,
-    optimizers,
-    rasterizer_seam,
-)
-from fragprune_graphdeco.call import CallInSource, RasterizerCall, drawing_functions, read_calls
-from fragprune_graphdeco.densifying import clones, needy, reaches, splits
-from fragprune_graphdeco.kernels import SURFEL
+from fragprune_graphdeco.adapter import CLONE as CLONE
+from fragprune_graphdeco.adapter import MODEL as MODEL
+from fragprune_graphdeco.adapter import SPLIT as SPLIT
+from fragprune_graphdeco.adapter import GraphdecoAdapter as GraphdecoAdapter
+from fragprune_graphdeco.adapter import GraphdecoDialect as GraphdecoDialect
+from fragprune_graphdeco.adapter import default as default
+from fragprune_graphdeco.adapter import group_names as group_names
+from fragprune_graphdeco.adapter import model_seam as model_seam
+from fragprune_graphdeco.adapter import no_noise as no_noise
+from fragprune_graphdeco.adapter import optimizers as optimizers
+from fragprune_graphdeco.adapter import rasterizer_seam as rasterizer_seam
+from fragprune_graphdeco.call import CallInSource as CallInSource
+from fragprune_graphdeco.call import RasterizerCall as RasterizerCall
+from fragprune_graphdeco.call import drawing_functions as drawing_functions
+from fragprune_graphdeco.call import read_calls as read_calls
+from fragprune_graphdeco.densifying import clones as clones
+from fragprune_graphdeco.densifying import needy as needy
+from fragprune_graphdeco.densifying import reaches as reaches
+from fragprune_graphdeco.densifying import splits as splits
+from fragprune_graphdeco.kernels import SURFEL as SURFEL
 from fragprune_graphdeco.plain import read_models
-from fragprune_graphdeco.reading import assigned, every
+from fragprune_graphdeco.reading import assigned as assigned
+from fragprune_graphdeco.reading import every as every
 from fragprune_plugins.adapting import HostRepo, Plain, hookimpl
-
-__all__ = [
-    "CLONE",
-    "MODEL",
-    "SPLIT",
-    "SURFEL",
-    "CallInSource",
-    "GraphdecoAdapter",
-    "GraphdecoDialect",
-    "RasterizerCall",
-    "assigned",
-    "clones",
-    "default",
-    "drawing_functions",
-    "every",
-    "group_names",
-    "model_seam",
-    "needy",
-    "no_noise",
-    "optimizers",
-    "rasterizer_seam",
-    "reaches",
-    "read_calls",
-    "splits",
-]
 
 
 @hookimpl
