@@ -201,8 +201,8 @@ class Fork:
         for tree in self.trees.values():
             skipped = reading.skipped(tree, known)
             named = {each: reading.options_of(each, known) for each in {*skipped.values()}}
-            own = {node: named[test] for node, test in skipped.items()}
-            found |= {node: names for node, names in own.items() if made.isdisjoint(names)}
+            under = {node: named[test] for node, test in skipped.items()}
+            found |= {node: names for node, names in under.items() if made.isdisjoint(names)}
         return found
 
     @cached_property

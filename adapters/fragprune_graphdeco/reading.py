@@ -336,9 +336,10 @@ Known = Callable[[ast.AST], list[Any]]
 def skipped(tree: ast.AST | None, known: Known) -> dict[ast.AST, ast.expr]:
     """What code does not do by the values that are known: nodes, with the test before each."""
     found: dict[ast.AST, ast.expr] = {}
-    for node in every(tree, ast.If, ast.IfExp):
+    branching: list[Any] = [n for n in nodes(tree) if isinstance(n, ast.If | ast.IfExp)]
+    for node in branching:
         taken = decided(node.test, known)
-        branch: Any = None if taken is None else node.orelse if taken else node.body
+        branch = None if taken is None else node.orelse if taken else node.body
         for each in branch if isinstance(branch, list) else [branch]:
             found |= dict.fromkeys(nodes(each), node.test)
     return found
