@@ -75,18 +75,15 @@ def adapters() -> str:
 ```
 
 {" ".join(rest)}"""
-    kinds = [
+    kinds = {
         kind
-        for kind in (
-            *vars(adapting).values(),
-            *(getattr(fragprune_graphdeco, name) for name in fragprune_graphdeco.__all__),
-        )
+        for kind in (*vars(adapting).values(), *vars(fragprune_graphdeco).values())
         if inspect.isclass(kind)
         and kind.__module__.startswith(("fragprune_plugins.hosts", "fragprune_graphdeco"))
         and not kind.__module__.endswith(".seams")
-    ]
-    kinds.sort(key=lambda kind: (kind.__module__, inspect.getsourcelines(kind)[1]))
-    return _page("Adapters", intro, *(_class(kind) for kind in kinds))
+    }
+    ordered = sorted(kinds, key=lambda each: (each.__module__, inspect.getsourcelines(each)[1]))
+    return _page("Adapters", intro, *map(_class, ordered))
 
 
 def python() -> str:
