@@ -167,61 +167,91 @@ def _second_length(array: Tensor | None) -> int:
 
 # ---- gradients ---------------------------------------------------------------------------------
 
-_DIFFERENTIABLE = ("image", "invdepth", "alpha", "features", "surface", "fragments_per_pixel")
-_COUNTED = (
-    *("radii", "fragments", "fragments_per_gaussian"),
-    *("weights_per_gaussian", "wins_per_gaussian", "winners"),
+_DIFFERENTIABLE = frozenset(
+    ("image", "invdepth", "alpha", "features", "surface", "fragments_per_pixel")
 )
 _LEARNABLE = tuple(name for name, *_ in binding.InputGrads._fields_[1:])
+
+Undraw = Callable[[Wanted, dict[str, Tensor]], dict[str, Tensor]]
+"""A backward pass, from gradients of outputs to gradients of the wanted inputs, by name."""
 
 
 def with_gradients(
     inputs: RasterInputs,
     thresholds: Tensor | None,
     draw: Callable[[Wanted], Mapping[str, Tensor]],
-    undraw: Callable[[Wanted, dict[str, Tensor]], dict[str, Tensor]],
+    undraw: Undraw,
 ) -> dict[str, Any]:
     """Draw in torch's graph.
 
     Args:
         draw: the forward pass; it gives tensors by their names in ``RasterOutputs``.
-        undraw: the backward pass, from gradients of these to gradients of inputs, by name.
+        undraw: the backward pass.
 
     Returns:
-        What ``draw`` gave, differentiable; None for what it did not give.
+        What ``draw`` gave, differentiable where that makes sense.
     """
     given = vars(inputs.splats) | {"hook": inputs.means2d_hook, "thresholds": thresholds}
     given["background"] = inputs.view.background
     tensors = {name: given[name] for name in _LEARNABLE if given.get(name) is not None}
+
+    def forward(wanted: Wanted) -> tuple[Mapping[str, Tensor], Collection[str]]:
+        drawn = draw(wanted)
+        return drawn, drawn.keys() - _DIFFERENTIABLE
+
+    return in_graph(tensors, forward, undraw)
+
+
+def in_graph(
+    tensors: Mapping[str, Tensor],
+    forward: Callable[[Wanted], tuple[Mapping[str, Tensor], Collection[str]]],
+    backward: Undraw,
+) -> dict[str, Tensor]:
+    """Run compiled code in torch's graph, where it can be differentiated once.
+
+    Args:
+        tensors: what may want gradients, by name; on any device and of any floating type.
+        forward: gives the outputs by name, and the names of those that have no gradient.
+        backward: from and to tensors on the compiled code's own device.
+
+    Returns:
+        The outputs.
+    """
     if not torch.is_grad_enabled():  # the function would be told that parameters want theirs
         tensors = {name: each.detach() for name, each in tensors.items()}
-    drawn = _Rasterize.apply(draw, undraw, tuple(tensors), *tensors.values())  # type: ignore[no-untyped-call]
-    return dict(zip((*_DIFFERENTIABLE, *_COUNTED), drawn, strict=True))
+    names: list[str] = []
+
+    def named(wanted: Wanted) -> tuple[Mapping[str, Tensor], Collection[str]]:
+        made, constant = forward(wanted)
+        names.extend(made)
+        return made, constant
+
+    made = _Compiled.apply(named, backward, tuple(tensors), *tensors.values())  # type: ignore[no-untyped-call]
+    return dict(zip(names, made, strict=True))
 
 
-class _Rasterize(torch.autograd.Function):
-    """The autograd function of ``with_gradients``."""
+class _Compiled(torch.autograd.Function):
+    """The autograd function of ``in_graph``."""
 
     @staticmethod
     def forward(
-        ctx: Any, draw: Any, undraw: Any, names: tuple[str, ...], *tensors: Tensor
-    ) -> tuple[Tensor | None, ...]:
+        ctx: Any, forward: Any, backward: Any, names: tuple[str, ...], *tensors: Tensor
+    ) -> tuple[Tensor, ...]:
         needed = zip(names, ctx.needs_input_grad[3:], strict=True)
-        wanted = frozenset(name for name, needs in needed if needs)
-        drawn = draw(wanted)
-        counted = [drawn.get(name) for name in _COUNTED]
-        ctx.mark_non_differentiable(*(each for each in counted if each is not None))
+        ctx.wanted = frozenset(name for name, needs in needed if needs)
+        made, constant = forward(ctx.wanted)
+        ctx.mark_non_differentiable(*(made[name] for name in constant))
         ctx.set_materialize_grads(False)
-        ctx.undraw, ctx.names, ctx.wanted = undraw, names, wanted
+        ctx.undraw, ctx.names, ctx.made = backward, names, tuple(made)
         # Saved for the sake of autograd's check against changes in place: ``undraw`` reads these.
         ctx.save_for_backward(*tensors)
-        return (*map(drawn.get, _DIFFERENTIABLE), *counted)
+        return tuple(made.values())
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
         tensors = ctx.saved_tensors
-        by = zip(_DIFFERENTIABLE, upstream, strict=False)
+        by = zip(ctx.made, upstream, strict=True)
         grads = ctx.undraw(ctx.wanted, {name: grad for name, grad in by if grad is not None})
         given: list[Tensor | None] = [None, None, None]
         for name, tensor in zip(ctx.names, tensors, strict=True):

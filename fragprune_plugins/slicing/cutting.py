@@ -12,13 +12,14 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
-from torch.autograd.function import once_differentiable
 
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.engines.calling import (
+    Wanted,
     address,
     empty,
     expect_ok,
+    in_graph,
     native_threads,
     plain,
 )
@@ -189,125 +190,59 @@ def _some(cut: Any, where: torch.device, dtype: torch.dtype) -> dict[str, Tensor
 
 # ---- autograd ----------------------------------------------------------------------------------
 
-# The differentiable inputs, in the order in which the autograd function takes them.
-_NAMES = (
-    "means",
-    "opacities",
-    "times",
-    "scales",
-    "scales_t",
-    "rotations",
-    "rotations_r",
-    "cov3d",
-    "sh",
-)
-
-
 _SHAPE = frozenset(("scales", "scales_t", "rotations", "rotations_r"))
 
-# The inputs that affect each output. If none of them needs a gradient, an engine skips the output's
-# part of the backward pass; in fine-tuning that is most of it.
 _FELT_BY = {
     "means": _SHAPE | {"means", "times"},
     "cov3d": _SHAPE | {"cov3d"},
     "opacities": _SHAPE | {"opacities", "times"},
     "colors": _SHAPE | {"sh", "means", "times"},
 }
-
-
-@dataclass
-class _Cut:
-    """The inputs of one cut that are not differentiable.
-
-    Attributes:
-        kernels: the engine's compiled functions.
-        arrays: the tensors that compiled code reads.
-    """
-
-    kernels: SliceKernels
-    splats: SpacetimeSplats
-    moment: Moment
-    arrays: dict[str, Tensor]
-
-    def given(self) -> structs.Spacetime:
-        """The C struct of the inputs; it points into ``arrays``."""
-        moment, sh = self.moment, self.splats.sh
-        return structs.Spacetime(
-            threads=native_threads(),
-            timestamp=moment.timestamp,
-            duration=moment.duration,
-            prefilter_var=moment.prefilter_var,
-            scale_modifier=moment.scale_modifier,
-            sh_degree=self.splats.sh_degree,
-            sh_degree_t=-1 if moment.sh_degree_t is None else moment.sh_degree_t,
-            sh_coefficients=0 if sh is None else sh.shape[1],
-            count=len(self.splats),
-            lengths=binding.Lengths(**{k: each.numel() for k, each in self.arrays.items()}),
-            **{name: address(array) for name, array in self.arrays.items()},
-        )
-
-
-class _Slice(torch.autograd.Function):
-    """The autograd function of a cut."""
-
-    @staticmethod
-    def forward(ctx: Any, cut: _Cut, *tensors: Tensor | None) -> tuple[Tensor | None, ...]:
-        n, kernels = len(cut.splats), cut.kernels
-        outputs = {
-            "means": kernels.empty(n, 3),
-            "cov3d": kernels.empty(n, 6),
-            "opacities": kernels.empty(n),
-            "colors": kernels.empty(n, 3) if "sh" in cut.arrays else None,
-        }
-        present = torch.empty(n, dtype=torch.bool, device=kernels.where)
-        addresses = {name: address(output) for name, output in outputs.items()}
-        kernels.call("slice", cut.given(), structs.Sliced(present=address(present), **addresses))
-        wanted = {n for n, needs in zip(_NAMES, ctx.needs_input_grad[1:], strict=True) if needs}
-        idle = [o for name, o in outputs.items() if o is not None and not wanted & _FELT_BY[name]]
-        ctx.mark_non_differentiable(present, *idle)
-        ctx.set_materialize_grads(False)
-        ctx.cut, ctx.present = cut, present
-        # Saved for the sake of autograd's check against changes in place: the cut reads these.
-        ctx.save_for_backward(*tensors)
-        return *outputs.values(), present
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
-        cut, tensors = ctx.cut, ctx.saved_tensors
-        by = [None if g is None else plain(g, cut.kernels.where) for g in upstream[:4]]
-        wanted = [n for n, needs in zip(_NAMES, ctx.needs_input_grad[1:], strict=True) if needs]
-        grads = {name: cut.kernels.empty(*cut.arrays[name].shape) for name in wanted}
-        cut.kernels.call(
-            "unslice",
-            cut.given(),
-            structs.Sliced(
-                present=address(ctx.present),
-                **{name: address(g) for name, g in zip(_FELT_BY, by, strict=True)},
-            ),
-            structs.SpacetimeGrads(**{name: address(grad) for name, grad in grads.items()}),
-        )
-        given: list[Tensor | None] = [None]
-        for name, tensor in zip(_NAMES, tensors, strict=True):
-            grad = grads.get(name)
-            given.append(None if grad is None else grad.to(tensor.device, tensor.dtype))
-        return tuple(given)
+"""The inputs that affect each output. If none of them needs a gradient, an engine skips the
+output's part of the backward pass; in fine-tuning that is most of it."""
 
 
 def slice_by(kernels: SliceKernels, splats: SpacetimeSplats, moment: Moment) -> Sliced:
     """Cut the Gaussians at the moment; differentiable in every tensor of the splats."""
-    tensors = {name: getattr(splats, name) for name in _NAMES}
-    read = {**tensors, "campos": moment.campos}
-    arrays = {name: plain(t, kernels.where) for name, t in read.items() if t is not None}
-    cut = _Cut(kernels, splats, moment, arrays)
-    means, cov3d, opacities, colors, present = _Slice.apply(  # type: ignore[no-untyped-call]
-        cut, *tensors.values()
+    held = {name: each for name, each in vars(splats).items() if isinstance(each, torch.Tensor)}
+    read = {**held, "campos": moment.campos}
+    arrays = {name: plain(each, kernels.where) for name, each in read.items()}
+    n, sh = len(splats), arrays.get("sh")
+    given = structs.Spacetime(
+        threads=native_threads(),
+        timestamp=moment.timestamp,
+        duration=moment.duration,
+        prefilter_var=moment.prefilter_var,
+        scale_modifier=moment.scale_modifier,
+        sh_degree=splats.sh_degree,
+        sh_degree_t=-1 if moment.sh_degree_t is None else moment.sh_degree_t,
+        sh_coefficients=0 if sh is None else sh.shape[1],
+        count=n,
+        lengths=binding.Lengths(**{name: each.numel() for name, each in arrays.items()}),
+        **{name: address(each) for name, each in arrays.items()},
     )
-    device = splats.device
-    return Sliced(
-        means=means.to(device),
-        cov3d=cov3d.to(device),
-        opacities=opacities.to(device),
-        present=present.to(device),
-        colors=None if colors is None else colors.to(device),
-    )
+    present = torch.empty(n, dtype=torch.bool, device=kernels.where)
+
+    def forward(wanted: Wanted) -> tuple[dict[str, Tensor], set[str]]:
+        made = {"means": (n, 3), "cov3d": (n, 6), "opacities": (n,)}
+        made |= {} if sh is None else {"colors": (n, 3)}
+        cut = {name: kernels.empty(*shape) for name, shape in made.items()} | {"present": present}
+        kernels.call(
+            "slice", given, structs.Sliced(**{k: address(each) for k, each in cut.items()})
+        )
+        idle = {name for name in made if not wanted & _FELT_BY[name]}
+        return cut, {"present", *idle}
+
+    def backward(wanted: Wanted, by: dict[str, Tensor]) -> dict[str, Tensor]:
+        by = {name: plain(grad, kernels.where) for name, grad in by.items()} | {"present": present}
+        grads = {name: kernels.empty(*arrays[name].shape) for name in wanted}
+        kernels.call(
+            "unslice",
+            given,
+            structs.Sliced(**{name: address(grad) for name, grad in by.items()}),
+            structs.SpacetimeGrads(**{name: address(grad) for name, grad in grads.items()}),
+        )
+        return grads
+
+    cut = in_graph(held, forward, backward)
+    return Sliced(**{name: each.to(splats.device) for name, each in cut.items()})

@@ -6,7 +6,6 @@ import ctypes
 import weakref
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -135,10 +134,7 @@ class CpuEngine:
         arrays = native_arrays(inputs, thresholds)
         drawing = _Drawing(inputs, self.library, self.workspace, arrays)
         drawn = with_gradients(inputs, thresholds, drawing.draw, drawing.undraw)
-        there: dict[str, Any] = {
-            name: None if each is None else each.to(inputs.splats.device)
-            for name, each in drawn.items()
-        }
+        there = {name: each.to(inputs.splats.device) for name, each in drawn.items()}
         pixels = inputs.view.width * inputs.view.height
         return RasterOutputs(
             evaluated_per_pixel=drawing.evaluated / pixels,
