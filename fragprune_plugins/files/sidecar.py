@@ -24,20 +24,12 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from fragprune_plugins.errors import SidecarError
-from fragprune_plugins.files.atomic import (
-    all_in_flight,
-    digest,
-    in_flight,
-    locked,
-    put,
-    rename,
-    replacing,
-)
+from fragprune_plugins.files import atomic
+from fragprune_plugins.files.atomic import all_in_flight, digest
 from fragprune_plugins.files.ply import read_thresholds
 from fragprune_plugins.files.reading import UntrustedFile, parse_json
 from fragprune_plugins.learning.finite import expect_finite
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.types import is_rim, is_stop
 
 SUFFIX = ".fragprune.safetensors"
 FORMAT = "fragprune-thresholds-1"
@@ -109,9 +101,9 @@ def save(model: Path, store: ThresholdStore, **about: Any) -> Path:
     """
     target = path_beside(model)
     if all_in_flight(model, _ADDRESSES):  # a dead process left it there: it would be read first
-        with locked(model):
+        with atomic.locked(model):
             _tidy(model)
-    with replacing(target, durable=True) as new:
+    with atomic.replacing(target, durable=True) as new:
         _write(new, store, SidecarInfo(len(store), digest(model), **about))
     return target
 
@@ -137,10 +129,10 @@ def replace_pair(path: Path, whole: Path, store: ThresholdStore | None, **about:
             sha = digest(whole)
             new = whole.with_name(beside.name)
             _write(new, store, SidecarInfo(len(store), sha, **about))
-            put(new, _address(path, sha))
+            atomic.put(new, _address(path, sha))
         elif beside.exists():  # it stays with the old model for as long as that is there
-            rename(beside, _address(path, digest(path) if path.is_file() else "none"))
-        put(whole, path)
+            atomic.rename(beside, _address(path, digest(path) if path.is_file() else "none"))
+        atomic.put(whole, path)
         if store is None:  # also where the model kept its bytes, and so its address
             for each in all_in_flight(path, _ADDRESSES):
                 each.unlink()
@@ -154,7 +146,7 @@ def _tidy(model: Path) -> None:
     addressed = _address(model, digest(model)) if waiting and model.is_file() else None
     for each in waiting:
         if each == addressed:
-            rename(each, path_beside(model))
+            atomic.rename(each, path_beside(model))
         else:
             each.unlink()
 
@@ -164,7 +156,7 @@ _ADDRESSES = "for-*"
 
 def _address(model: Path, sha: str) -> Path:
     """Where a sidecar lies whose model has this digest and is not, or no longer, in place."""
-    return in_flight(model, f"for-{sha[:32]}")
+    return atomic.in_flight(model, f"for-{sha[:32]}")
 
 
 def _write(path: Path, store: ThresholdStore, info: SidecarInfo) -> None:
@@ -205,24 +197,22 @@ def load(
             rows than the model.
     """
     state, info = _read(model, find(model) or path_beside(model))
-    shape, wanted = tuple(state["logits"].shape), digest(model)
+    shape, wanted, name = tuple(state["logits"].shape), digest(model), Path(model).name
     if wanted != info.model_sha256 or shape != (info.rows,):
-        raise SidecarError(
-            str(path_beside(model)),
-            f"thresholds of another model (sha256 {info.model_sha256[:12]}, {info.rows} rows)",
-            f"those of {Path(model).name} (sha256 {wanted[:12]})",
-            _remedy(model),
-        )
-    if rows not in (None, info.rows):
-        raise SidecarError(
-            str(path_beside(model)),
-            f"thresholds of {info.rows} Gaussian(s)",
-            f"{rows}, one for each in {Path(model).name}",
-            _remedy(model),
-        )
-    store = ThresholdStore(info.rows, device)
-    store.load_state_dict(state)
-    return store, info
+        found = f"thresholds of another model (sha256 {info.model_sha256[:12]}, {info.rows} rows)"
+        expected = f"those of {name} (sha256 {wanted[:12]})"
+    elif rows not in (None, info.rows):
+        found = f"thresholds of {info.rows} Gaussian(s)"
+        expected = f"{rows}, one for each in {name}"
+    else:
+        store = ThresholdStore(0, device)
+        try:
+            store.load_state_dict(state)
+        except SidecarError as error:
+            found, expected = error.found, error.expected
+        else:
+            return store, info
+    raise SidecarError(str(path_beside(model)), found, expected, _remedy(model))
 
 
 def _remedy(model: Path) -> str:
@@ -230,7 +220,7 @@ def _remedy(model: Path) -> str:
 
 
 def _read(model: Path, path: Path) -> tuple[dict[str, Any], SidecarInfo]:
-    """Read a sidecar's store state and metadata, without a look at the model beside it."""
+    """Read a sidecar's state, which the store checks, and its metadata; the model is not read."""
     expected, remedy = f"a file of format {FORMAT}", _remedy(model)
     kind = UntrustedFile(SidecarError, "unreadable", expected, remedy, missing=remedy)
     with kind.reading(path) as reading:
@@ -247,21 +237,14 @@ def _read(model: Path, path: Path) -> tuple[dict[str, Any], SidecarInfo]:
                 host_commit=metadata["host_commit"],
                 settings=parse_json(metadata["settings"]),
             )
-            state = {"adam_step": float(metadata["adam_step"]), "steps": int(metadata["steps"])}
             if not isinstance(info.settings, dict):
                 raise ValueError("settings that are no object")
-            stop = float(metadata["stop"]) if "stop" in metadata else None
-            if not is_stop(stop):
-                raise ValueError(f"a stop of {stop}")
-            rim = metadata.get("rim", "hard")
-            if not is_rim(rim):
-                raise ValueError(f"a rim {rim!r:.40}")
+            state = {"adam_step": float(metadata["adam_step"]), "steps": int(metadata["steps"])}
+            state |= {"stop": float(metadata["stop"])} if "stop" in metadata else {}
             if not (0 <= state["adam_step"] < math.inf and 0 <= state["steps"] < 1 << 63):
                 raise ValueError(f"{state['adam_step']:g} and {state['steps']} steps")
-            tensors: dict[str, torch.Tensor] = {}
+            tensors: dict[str, Any] = {"rim": metadata.get("rim", "hard")}
             for name in ("logits", "exp_avg", "exp_avg_sq"):
                 reading.place = f"tensor {name}"
                 tensors[name] = file.get_tensor(name)
-                if tensors[name].dtype != torch.float32:
-                    raise ValueError(f"{tensors[name].dtype}, not torch.float32")
-    return tensors | state | {"stop": stop, "rim": rim}, info
+    return tensors | state, info

@@ -304,27 +304,21 @@ class ThresholdStore:
                 can have left.
         """
         rows = {key: state[key] for key in ("logits", "exp_avg", "exp_avg_sq")}
-        remedy = "Use a sidecar written by fragprune."
+        stop, rim = state.get("stop"), state.get("rim", "hard")  # absent before there were any
         kinds = [(tuple(t.shape), t.dtype) for t in rows.values()]
         if set(kinds) != {((rows["logits"].numel(),), torch.float32)}:
-            raise SidecarError("threshold state", f"shapes {kinds}", "three (N,) float32", remedy)
+            raise _misfit(f"shapes {kinds}", "three (N,) float32")
         for name, tensor in rows.items():
             wrong = ~tensor.isfinite()
             if name == "exp_avg_sq":
                 wrong |= tensor < 0
             if wrong.any():
-                raise SidecarError(
-                    "threshold state",
-                    f"{name} that cannot be in {int(wrong.sum())} of {len(tensor)} rows",
-                    "finite numbers, and second moments that are not negative",
-                    remedy,
-                )
-        stop = state.get("stop")  # absent from those of earlier versions
+                found = f"{name} that cannot be in {int(wrong.sum())} of {len(tensor)} rows"
+                raise _misfit(found, "finite numbers, and second moments that are not negative")
         if not is_stop(stop):
-            raise SidecarError("threshold state", f"a stop of {stop}", "1e-4 to 1", remedy)
-        rim = state.get("rim", "hard")
+            raise _misfit(f"a stop of {stop}", "1e-4 to 1")
         if not is_rim(rim):
-            raise SidecarError("threshold state", f"a rim {rim!r:.40}", "hard or soft", remedy)
+            raise _misfit(f"a rim {rim!r:.40}", "hard or soft")
         self.stop, self.rim = stop, rim
         device, lr = self.logits.device, self.optimizer.param_groups[0]["lr"]
         self._bind(rows["logits"].to(device), lr)
@@ -373,3 +367,8 @@ class ThresholdStore:
                 f"{len(self)}, one per threshold",
                 "Report this with the host's name: its rows changed, and the store was not told.",
             )
+
+
+def _misfit(found: str, expected: str) -> SidecarError:
+    """The error of a state that no store can have had."""
+    return SidecarError("threshold state", found, expected, "Use a sidecar written by fragprune.")
