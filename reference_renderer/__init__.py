@@ -11,14 +11,9 @@ rasterizer, including the derivatives that it leaves out.
 """
 
 from reference_renderer.project import Footprints
-from reference_renderer.render import (
-    Blended,
-    blended,
-    render,
-    render_footprints,
-)
+from reference_renderer.render import Blended, blended, render, render_footprints
 from reference_renderer.scene import Camera, Gaussians, Options, Rendering
-from reference_renderer.spacetime import SpacetimeGaussians, slice_gaussians
+from reference_renderer.slice4d import SpacetimeGaussians, slice_gaussians
 
 __all__ = [
     "Blended",
