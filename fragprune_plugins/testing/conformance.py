@@ -17,7 +17,6 @@ from fragprune_plugins.testing import invariants
 from fragprune_plugins.testing.fresh import FreshProcessError, NotApplicable, fresh
 from fragprune_plugins.testing.host import Host
 from fragprune_plugins.testing.invariants import Case
-from fragprune_plugins.testing.plugin import COVERED
 
 MINIATURE, INSTALLED = "miniature", "installed"
 
@@ -73,22 +72,20 @@ class AdapterConformance:
         )
 
     @pytest.fixture
-    def check(self, request: pytest.FixtureRequest) -> Callable[..., None]:
-        """Run checks in fresh processes and record their coverage."""
+    def check(self) -> Callable[..., None]:
+        """Run checks in fresh processes."""
 
         def run(*calls: tuple[Any, ...]) -> None:
-            covered, failure = [], ""
+            failure = ""
             for call in calls:
                 try:
-                    covered.append(fresh(*call))
+                    fresh(*call)
                 except NotApplicable as reason:
                     pytest.skip(str(reason))
                 except FreshProcessError as error:
                     failure = str(error)
                 if failure:  # here, or pytest would print it twice
                     pytest.fail(failure, pytrace=False)
-            note = f"{len(calls) - 1} orders of {covered[0]}; " if len(calls) > 1 else ""
-            request.node.user_properties.append((COVERED, note + covered[-1]))
 
         return run
 

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 RESULTS = pytest.StashKey[list[dict[str, Any]]]()
-WHAT, COVERED = "fragprune invariant", "fragprune covered"
+WHAT = "fragprune invariant"
 NOT_APPLICABLE = "n/a: "
 """Begins the reason where a promise cannot be asked of a host; where this machine lacks something,
 the test is skipped."""
@@ -67,7 +67,6 @@ class _Collector:
                 "host": host,
                 "invariant": invariant,
                 "outcome": "n/a" if inapplicable else report.outcome,
-                "covered": properties.get(COVERED, ""),
                 "reason": reason.removeprefix(NOT_APPLICABLE),
                 "seconds": round(report.duration, 2),
             }

@@ -1,7 +1,7 @@
 """The promises that every adapter keeps, each as a check of one host.
 
-A check runs in its own process. It returns a few words about its coverage, and raises
-AssertionError with the difference if the promise is broken.
+A check runs in its own process. It raises AssertionError with the difference if the promise is
+broken.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ ASKED = {"opacity": {"opacities"}, "appearance": {"opacities", "sh", "colors"}}
 """Fields of the Gaussians whose gradients an engine works out; the others cost nothing."""
 
 
-def freeze(case: Case) -> str:
+def freeze(case: Case) -> None:
     """In stage 2 only the parameters of ``--train`` and the thresholds change, to the bit."""
     driver = case.driver
     moving: dict[str, frozenset[str] | None] = {
@@ -58,7 +58,6 @@ def freeze(case: Case) -> str:
             learned = host.store(model)
             require(learned.steps == 4, f"--train {train}: {learned.steps} threshold steps of 4")
             require(not torch.equal(learned.logits, thresholds), "thresholds stood still")
-    return f"{len(moving)} choices of --train, {len(driver.routine)} routines"
 
 
 def _asking(driver: Host, model: Any) -> set[str]:

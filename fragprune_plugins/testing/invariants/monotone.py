@@ -14,9 +14,8 @@ from fragprune_plugins.testing.host import Chance, Running, joint
 from fragprune_plugins.testing.invariants.case import Case, FixedThresholds, open_all, require
 
 
-def monotone(case: Case) -> str:
+def monotone(case: Case) -> None:
     """A higher threshold adds no fragment; a completely truncated Gaussian leaves no trace."""
-    fragments = 0
     for seed in range(5):
         fixed = FixedThresholds()
         with joint(plugins=[fixed], **case.options()) as host:
@@ -37,9 +36,7 @@ def monotone(case: Case) -> str:
             require((after.fragments <= before.fragments).all(), "a pixel has more fragments")
             require(torch.equal(seen, still_seen), "radii, by which hosts densify, changed")
             require(after.fragments.sum() < before.fragments.sum(), "nothing was truncated")
-            fragments += int(before.fragments.sum())
     _no_trace(case)
-    return f"{fragments} fragments in 5 pictures"
 
 
 def _counted(

@@ -44,7 +44,7 @@ def orders(longest: int) -> list[str]:
     ]
 
 
-def off_is_off(case: Case, order: str) -> str:
+def off_is_off(case: Case, order: str) -> None:
     """In this order of events, every object of the host is its own whenever we are inactive."""
     dialect = case.adapter.dialect(case.repo)
     compiled = dialect.modules(_never_drawn)
@@ -68,7 +68,6 @@ def off_is_off(case: Case, order: str) -> str:
             for seam, original in originals.items():
                 ours = _found(seam) is not original
                 require(ours == active, f"{where}: {seam} is {'ours' if ours else 'its own'}")
-    return f"{len(originals)} seams of {len(case.seams)}"
 
 
 def _imported(seams: Iterable[Seam]) -> list[Seam]:
@@ -139,7 +138,7 @@ def _wrapped_names(case: Case) -> list[str]:
     ]
 
 
-def nothing_stays(case: Case) -> str:
+def nothing_stays(case: Case) -> None:
     """After a session with learned thresholds the host draws and computes as it does alone."""
     names = list(case.adapter.dialect(case.repo).modules(_never_drawn))
     fixed = FixedThresholds()
@@ -171,7 +170,7 @@ def nothing_stays(case: Case) -> str:
                 own = host.render(camera, model)["render"]
             require(torch.equal(own, alone), "deactivated, the host's picture is not its own")
         if not _activate(host.session, originals):
-            return f"{len(names)} stand-ins, activated once"
+            return
         try:
             host.session.activate()
         except SessionError:
@@ -183,4 +182,3 @@ def nothing_stays(case: Case) -> str:
         with torch.no_grad():
             host.render(camera, model)
         require(fixed.calls == 2, "activated again, a picture asked for no thresholds")
-    return f"{len(names)} stand-ins, activated twice"
