@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import gc
 import os
 import runpy
 import sys
@@ -136,7 +135,6 @@ def forget_modules(root: Path, known: set[str], packages: tuple[str, ...] = ()) 
             )
         if own:
             del sys.modules[name]
-    gc.collect()  # closes objects of module globals, such as the viewer's socket
 
 
 def host_device(wanted: str, engine: str) -> str:

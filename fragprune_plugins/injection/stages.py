@@ -271,6 +271,7 @@ class Stages:
         finally:
             self.output = session.output or self.output
             process.forget_modules(self.repo.root, known, self.adapter.installed)
+            gc.collect()  # closes objects of module globals, such as the viewer's socket
             if learn:
                 self.learned = session.finish()
                 self.curves = session.curves

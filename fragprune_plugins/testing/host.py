@@ -14,7 +14,7 @@ import math
 import shutil
 import sys
 from argparse import ArgumentParser
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
@@ -31,6 +31,7 @@ from fragprune_plugins.constants import NEUTRAL_LOGIT
 from fragprune_plugins.hosts.adapter import HostAdapter
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.cpu_only import cpu_only
+from fragprune_plugins.injection.process import forget_modules
 from fragprune_plugins.injection.session import Session
 from fragprune_plugins.learning.schedule import JointSchedule, Settings
 from fragprune_plugins.plugins.loading import GROUP, load_plugins
@@ -363,7 +364,7 @@ class Running:
 
 
 @contextlib.contextmanager
-def imported(path: Path, packages: Sequence[str] = ()) -> Iterator[None]:
+def imported(path: Path, packages: tuple[str, ...] = ()) -> Iterator[None]:
     """Put a host's folder first on the path; afterwards its modules are forgotten.
 
     Args:
@@ -375,11 +376,7 @@ def imported(path: Path, packages: Sequence[str] = ()) -> Iterator[None]:
         yield
     finally:
         sys.path.remove(str(path))
-        for name in sys.modules.keys() - known:
-            file = getattr(sys.modules[name], "__file__", None) or ""
-            own = not packages or name.split(".")[0] in packages
-            if own and Path(file).is_relative_to(path):
-                del sys.modules[name]
+        forget_modules(path, known, packages)
 
 
 @cache
