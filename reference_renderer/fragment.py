@@ -133,7 +133,6 @@ def gates(
         falloff: (K, P) exp(-q / 2).
         visible: (K,) the cutoffs by alpha_min alone.
         thresholds: (K,) or None.
-        options: ``rim`` chooses.
     """
     seen = (q >= 0) & (q <= visible[:, None])
     if thresholds is None:
@@ -149,13 +148,7 @@ def gates(
 def fragments(
     footprints: Footprints, pixels: Tensor, thresholds: Tensor | None, options: Options
 ) -> Fragments:
-    """The fragments of every footprint at every pixel.
-
-    Args:
-        footprints: K of them.
-        pixels: (P, 2) x, y.
-        thresholds: (K,) or None.
-    """
+    """The fragments of K footprints at P pixels, x and y (P, 2), by thresholds (K,) or None."""
     dx, dy = offsets(footprints, pixels)
     q, depth = squared_distances(footprints.conic, dx, dy), None
     if footprints.plane is not None:

@@ -132,8 +132,6 @@ def project(camera: Camera, gaussians: Gaussians, options: Options) -> Footprint
     """Footprints of Gaussians that are all in front of the camera.
 
     Args:
-        camera: the view.
-        gaussians: K of them.
         options: scale_modifier, dilation and compensation are used.
     """
     points = transform(gaussians.means, camera.viewmatrix)[:, :3]

@@ -134,10 +134,6 @@ def blended(
     """The fragments of each block of the image, one by one, as ``render`` blends them.
 
     Args:
-        camera: the view.
-        gaussians: N of them.
-        thresholds: as in ``render``.
-        options: as in ``render``.
         every: 1 for all tiles, 2 for every second one, and so on.
     """
     options = options or Options()
@@ -168,16 +164,14 @@ def render_footprints(
     means2d_hook: Tensor | None = None,
     options: Options | None = None,
 ) -> Rendering:
-    """Draw projected Gaussians, each truncated at its own threshold.
+    """Draw projected Gaussians, each truncated at its own threshold; the rest is as in ``render``.
 
     Args:
         camera: only its size and background are used.
         footprints: N of them. Their radius is ignored, and the rendering's radii are 0. A footprint
             is culled if its depth is not positive or its conic is not positive definite.
         tiles: (N, 4) first and past-the-last tile x0, y0, x1, y1 of each.
-        thresholds: as in ``render``.
-        means2d_hook: as in ``render``.
-        options: as in ``render``; options of the projection are ignored.
+        options: those of the projection are ignored.
     """
     options = options or Options()
     if means2d_hook is not None:
@@ -198,8 +192,7 @@ def collect(
     Args:
         front: (K,) rows of the N Gaussians that the footprints stand for.
         radii: (N,) int32 pixels.
-        blocks: row by row.
-        drawings: of each block.
+        blocks: row by row, a drawing of each.
     """
     per_gaussian = torch.zeros_like(radii)
     weights = drawings[0].weights.new_zeros(len(radii))
@@ -251,8 +244,7 @@ def cut(
     """Cut the image into tiles, row by row, or take all of it as one block.
 
     Args:
-        footprints: K of them.
-        rects: (K, 4) tiles of each.
+        rects: (K, 4) tiles of each footprint.
         drawable: (K,) bool.
         options: ``tiles`` decides.
         every: 1 for all tiles, 2 for every second one, and so on.

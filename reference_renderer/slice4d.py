@@ -84,7 +84,6 @@ def slice_gaussians(
     """Cut at a moment. Absent Gaussians have their mean at the camera, and zeros elsewhere.
 
     Args:
-        given: the Gaussians.
         campos: (3,) the camera.
         timestamp: the moment.
         duration: the cosines' longest period.
@@ -217,13 +216,8 @@ def separate(
     zeros.
 
     Args:
-        means: (N, 3).
-        opacities: (N,).
-        times: (N,) means in time.
         scales: (N, 4): standard deviations x, y, z, and the variance in time.
-        rotations: (N, 4) quaternions.
-        timestamp: the moment.
-        prefilter_var: when positive, added to the variance in time.
+        rotations: (N, 4) quaternions. The rest is as in ``joint``.
     """
     since = (timestamp - times).detach()
     marginal = _marginal(since, scales[:, 3].detach(), prefilter_var)

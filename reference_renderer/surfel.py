@@ -29,13 +29,7 @@ FAR = 100.0
 
 
 def project_surfels(camera: Camera, gaussians: Gaussians, options: Options) -> Footprints:
-    """Footprints of surfels whose means are all in front of the camera.
-
-    Args:
-        camera: the view.
-        gaussians: K of them, with scales (K, 2).
-        options: scale_modifier is used.
-    """
+    """Footprints of K surfels, with scales (K, 2), whose means are all in front of the camera."""
     assert gaussians.scales is not None
     assert gaussians.rotations is not None
     axes = rotation_matrices(gaussians.rotations)
@@ -62,7 +56,6 @@ def planes(camera: Camera, means: Tensor, sides: Tensor) -> Tensor:
     """(K, 3, 3) maps of a plane's (u, v, 1) to (x w, y w, w), pixels and view depth.
 
     Args:
-        camera: the view.
         means: (K, 3) world, where u = v = 0.
         sides: (K, 3, 2) world, the steps of u and of v.
     """

@@ -219,10 +219,9 @@ def _share(steps: int, of: int) -> float:
 
 
 class JointSchedule(Schedule):
-    """Thresholds learn inside the host's own training, from one iteration on.
+    """Thresholds learn inside the host's own training, whose length ``iterations`` is.
 
     Args:
-        settings: ``iterations`` is the host's whole run.
         from_step: first step that learns.
     """
 

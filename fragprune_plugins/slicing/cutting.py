@@ -49,8 +49,6 @@ def slice_at(splats: SpacetimeSplats, moment: Moment, *, engine: str | Engine = 
     gradient of the highest cosine, with the opposite sign.
 
     Args:
-        splats: the Gaussians.
-        moment: when and from where.
         engine: a name for ``create_engine``, or an engine. If it is not ours, the fastest of our
             engines on the device cuts.
 
