@@ -13,7 +13,6 @@ from typing import Any
 
 import pytest
 
-RESULTS = pytest.StashKey[list[dict[str, Any]]]()
 WHAT = "fragprune invariant"
 NOT_APPLICABLE = "n/a: "
 """Begins the reason where a promise cannot be asked of a host; where this machine lacks something,
@@ -30,11 +29,6 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
-def pytest_configure(config: pytest.Config) -> None:
-    """Make an empty list of results."""
-    config.stash[RESULTS] = []
-
-
 def pytest_itemcollected(item: pytest.Item) -> None:
     """Note the adapter and the invariant of a test, for its report."""
     kind: Any = getattr(item, "cls", None)
@@ -46,22 +40,19 @@ def pytest_itemcollected(item: pytest.Item) -> None:
         item.user_properties.append((WHAT, [adapter, place.id, invariant]))
 
 
-class _Collector:
-    """Turns reports of tests into results."""
-
-    def __init__(self, results: list[dict[str, Any]]) -> None:
-        self.results = results
-
-    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Keep the outcome of the test itself, or of a failed set-up."""
-        properties: dict[str, Any] = dict(report.user_properties)
+def results_of(stats: dict[str, list[Any]]) -> list[dict[str, Any]]:
+    """What became of the kit's tests, in their order: outcomes of tests, and of failed set-ups."""
+    reports = [each for kind in stats.values() for each in kind if hasattr(each, "user_properties")]
+    results = []
+    for report in sorted(reports, key=lambda each: each.start):
+        properties = dict(report.user_properties)
         if WHAT not in properties or (report.when != "call" and report.passed):
-            return
+            continue
         adapter, host, invariant = properties[WHAT]
         reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longreprtext
         reason = "" if report.passed else str(reason).strip().removeprefix("Skipped: ")
         inapplicable = report.skipped and reason.startswith(NOT_APPLICABLE)
-        self.results.append(
+        results.append(
             {
                 "adapter": adapter,
                 "host": host,
@@ -71,16 +62,12 @@ class _Collector:
                 "seconds": round(report.duration, 2),
             }
         )
-
-
-def pytest_sessionstart(session: pytest.Session) -> None:
-    """Register the collector of results."""
-    session.config.pluginmanager.register(_Collector(session.config.stash[RESULTS]))
+    return results
 
 
 def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
     """Print a row for each adapter, a column for each invariant, and reasons of skips."""
-    results = config.stash[RESULTS]
+    results = results_of(terminalreporter.stats)
     if not results:
         return
     if target := config.getoption("--fragprune-report"):
