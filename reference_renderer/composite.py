@@ -26,15 +26,5 @@ def alive(alpha: Tensor, transmittance_min: float, stop: float | None = None) ->
 
 
 def weights_of(alpha: Tensor) -> Tensor:
-    """(K, P) alpha T of each fragment; alpha as in ``blend``."""
+    """(K, P) alpha T of fragments in depth order, whose alpha is 0 where not drawn or stopped."""
     return alpha * transmittances(alpha)[:-1]
-
-
-def blend(alpha: Tensor, channels: Tensor) -> tuple[Tensor, Tensor]:
-    """Sum of alpha T channel, (C, P), and the final transmittance, (P,).
-
-    Args:
-        alpha: (K, P) of fragments in depth order, 0 where not drawn or stopped.
-        channels: (K, C) of each Gaussian.
-    """
-    return channels.mT @ weights_of(alpha), transmittances(alpha)[-1]

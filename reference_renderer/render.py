@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from reference_renderer.composite import alive, blend, transmittances, weights_of
+from reference_renderer.composite import alive, transmittances, weights_of
 from reference_renderer.fragment import fragments
 from reference_renderer.project import (
     TILE,
@@ -283,21 +283,20 @@ def draw(
     more = [] if here.features is None else [here.features]
     channels = torch.cat([here.color, 1 / here.depth[:, None], *more], dim=1)
     alpha = found.alpha * live
-    sums, left = blend(alpha, channels)
+    weights, left = weights_of(alpha), transmittances(alpha)[-1:]
     counted = (found.drawn & live).to(torch.int32)
-    weights = weights_of(alpha.detach())
     shape = (len(block.y), len(block.x))
     surface = None
     if found.depth is not None and here.normal is not None:
         surface = surface_of(alpha, found.drawn & live, found.depth, here.normal, options.near)
         surface = surface.reshape(-1, *shape)
     return Drawing(
-        layers=torch.cat([sums, left[None]]).reshape(-1, *shape),
+        layers=torch.cat([channels.mT @ weights, left]).reshape(-1, *shape),
         fragments=counted.sum(dim=0, dtype=torch.int32).reshape(shape),
         per_row=counted.sum(dim=1, dtype=torch.int32),
         gate=(found.gate * live).sum(),
-        weights=weights.sum(dim=1),
-        winners=winners_of(weights, block.rows).reshape(shape),
+        weights=weights.detach().sum(dim=1),
+        winners=winners_of(weights.detach(), block.rows).reshape(shape),
         surface=surface,
     )
 
@@ -311,19 +310,14 @@ def winners_of(weights: Tensor, rows: Tensor) -> Tensor:
 
 
 def sample_points(block: Block, options: Options, like: Tensor) -> Tensor:
-    """(P, 2) where a block's pixels are sampled, in like's dtype and on its device."""
-    points = pixel_grid(block, like)
+    """(P, 2) x, y at which a block's pixels are sampled, row by row, in like's dtype."""
+    x = torch.arange(block.x.start, block.x.stop, dtype=like.dtype, device=like.device)
+    y = torch.arange(block.y.start, block.y.stop, dtype=like.dtype, device=like.device)
+    points = torch.cartesian_prod(y, x).flip(1)
     if options.sample_offsets is None:
         return points
     columns, rows = slice(block.x.start, block.x.stop), slice(block.y.start, block.y.stop)
     return points + options.sample_offsets[rows, columns].reshape(-1, 2).detach().to(like)
-
-
-def pixel_grid(block: Block, like: Tensor) -> Tensor:
-    """(P, 2) x, y of a block's pixels, row by row, in like's dtype and on its device."""
-    x = torch.arange(block.x.start, block.x.stop, dtype=like.dtype, device=like.device)
-    y = torch.arange(block.y.start, block.y.stop, dtype=like.dtype, device=like.device)
-    return torch.cartesian_prod(y, x).flip(1)
 
 
 def assemble(blocks: list[Block], parts: list[Tensor]) -> Tensor:

@@ -48,6 +48,10 @@ _FAULTS = (Exception, SystemExit)
 class _Manager(pluggy.PluginManager):
     """Finds the hooks of adapters fast: each has some eighty names, and few have a hook."""
 
+    def __init__(self) -> None:
+        super().__init__(hookspecs.PROJECT)
+        self.add_hookspecs(hookspecs)
+
     def parse_hookimpl_opts(self, plugin: Any, name: str) -> Any:
         """The options of a hook; None for what is not marked as one."""
         if isinstance(plugin, HostAdapter):
@@ -57,12 +61,6 @@ class _Manager(pluggy.PluginManager):
             if not any(hasattr(each, f"{self.project_name}_impl") for each in both):
                 return None
         return super().parse_hookimpl_opts(plugin, name)
-
-
-def _manager() -> pluggy.PluginManager:
-    manager = _Manager(hookspecs.PROJECT)
-    manager.add_hookspecs(hookspecs)
-    return manager
 
 
 @dataclass
@@ -82,7 +80,7 @@ class Plugins:
     findings: list[Finding] = field(default_factory=list)
     loaded: dict[str, str] = field(default_factory=dict)
     engines: dict[tuple[str, torch.device], Engine] = field(default_factory=dict)
-    _manager: pluggy.PluginManager = field(default_factory=_manager, init=False, repr=False)
+    _manager: pluggy.PluginManager = field(default_factory=_Manager, init=False, repr=False)
     _off: set[tuple[str, str]] = field(default_factory=set, init=False, repr=False)
 
     def register(self, plugin: object, name: str) -> None:
