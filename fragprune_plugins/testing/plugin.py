@@ -89,14 +89,8 @@ def table(results: list[dict[str, Any]]) -> list[str]:
     for result in results:
         row = rows.setdefault((result["adapter"], result["host"]), {})
         row[result["invariant"]] = _SIGNS.get(result["outcome"], result["outcome"])
-    heads = ("adapter", "host")
-    widths = [max(len(head), *(len(key[i]) for key in rows)) + 2 for i, head in enumerate(heads)]
-    cells = [max(len(column), 7) + 2 for column in columns]
-
-    def line(names: tuple[str, str], values: list[str]) -> str:
-        left = "".join(f"{name:<{width}}" for name, width in zip(names, widths, strict=True))
-        right = "".join(f"{value:<{width}}" for value, width in zip(values, cells, strict=True))
-        return (left + right).rstrip()
-
-    body = [line(key, [row.get(column, "-") for column in columns]) for key, row in rows.items()]
-    return [line(heads, columns), *body]
+    lines = [("adapter", "host", *columns)]
+    lines += [(*key, *(row.get(column, "-") for column in columns)) for key, row in rows.items()]
+    widths = [max(map(len, cells)) + 2 for cells in zip(*lines, strict=True)]
+    padded = [[f"{c:<{w}}" for c, w in zip(line, widths, strict=True)] for line in lines]
+    return ["".join(cells).rstrip() for cells in padded]

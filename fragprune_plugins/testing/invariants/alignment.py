@@ -34,11 +34,8 @@ def alignment(case: Case) -> None:
     )
     @given(
         st.lists(
-            st.builds(
-                lambda name, seed, share: (name, Chance(seed, share)),
-                st.sampled_from(names),
-                st.integers(0, 99),
-                st.floats(0.05, 0.6),
+            st.tuples(
+                st.sampled_from(names), st.builds(Chance, st.integers(0, 99), st.floats(0.05, 0.6))
             ),
             min_size=1,
             max_size=7,
