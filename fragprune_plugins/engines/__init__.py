@@ -64,7 +64,7 @@ def device_for(wanted: str = "auto", engine: str = "auto") -> torch.device:
         raise UsageError(
             f"--device {wanted}",
             f"{seen or 'no'} CUDA device{'' if seen == 1 else 's'}",
-            "that one",
+            f"{wanted}, as torch sees it",
             "Use --device cpu, or auto.",
         )
     if engine in ("cpu", "cuda") and device.type != engine:
@@ -101,7 +101,9 @@ def create_engine(name: str, device: torch.device | str = "cpu") -> Engine:
         native = str(device).startswith("cpu") and binding.available()
         name = "cpu" if native else "reference"
     if name not in ENGINES:
-        raise EngineError("engine", repr(name), f"one of auto, {', '.join(ENGINES)}", "Choose one.")
+        raise EngineError(
+            "engine", repr(name), f"one of auto, {', '.join(ENGINES)}", "Choose one of these."
+        )
     module, _, kind = ENGINES[name].partition(":")
     engine: Engine = getattr(import_module(f"{__name__}.{module}"), kind)()
     return engine

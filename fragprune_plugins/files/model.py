@@ -56,7 +56,7 @@ class Model:
                 "Model.f_rest",
                 f"{self.f_rest.shape[1]} coefficients",
                 "0, 3, 8 or 15 (SH degree 0 to 3)",
-                "Check it.",
+                "Pass f_rest as (N, coefficients, 3), without the first coefficient.",
             )
         if self.thresholds is not None and len(self.thresholds) != n:
             raise AlignmentError(

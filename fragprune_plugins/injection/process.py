@@ -110,7 +110,7 @@ def run_main(script: Path, module: str = "") -> None:
             raise error.__cause__ from None
         if error.code not in (None, 0):
             found = f"ended with exit code {error.code}"
-            raise HostFailed(script.name, found, "0", READ) from error
+            raise HostFailed(script.name, found, "exit code 0", READ) from error
 
 
 _ENVIRONMENT = {"site-packages", "dist-packages"}

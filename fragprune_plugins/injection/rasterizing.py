@@ -153,7 +153,8 @@ def on_rasterize(session: SessionState, call: SeamCall) -> Any:
     if len(means) != expected:
         where, found = f"{session.adapter.name}: rasterizer call", f"{len(means)} Gaussians"
         said = f"{expected} of {len(state.store)}, one per drawn threshold"
-        raise AlignmentError(where, found, said, "Report this with the host's commit.")
+        remedy = "Report this with the host's commit: it draws other rows than its model has."
+        raise AlignmentError(where, found, said, remedy)
     stage = state.stage
     presses = stage is not None and stage.learning and session.settings.goal.on_area
     if not state.store.cuts and not presses:
@@ -298,7 +299,7 @@ def refuse_scaled(
     if session.learn and scaler.is_enabled():
         found = "a scaled loss, beside which the pressure vanishes"
         remedy = "Train in float32, or with GradScaler(enabled=False)."
-        raise UsageError("GradScaler", found, "a loss as it is", remedy)
+        raise UsageError("GradScaler", found, "a loss that nothing scales", remedy)
     return scale(*args, **kwargs)
 
 

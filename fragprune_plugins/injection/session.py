@@ -82,7 +82,8 @@ class Session(SessionState):
         """
         global _active
         if _active is not None:
-            raise SessionError("activate()", "a session is active", "none", "Deactivate it first.")
+            remedy = "Deactivate that one first: fragprune_plugins.deactivate()."
+            raise SessionError("activate()", "a session is active", "no active session", remedy)
         if self.learn:
             ranks.expect_one()
         packages = self.adapter.installed if self.repo.package else ()

@@ -75,7 +75,7 @@ class _Weighted(Goal):
     def __post_init__(self) -> None:
         if self.weight is not None and not 0 <= number("pressure", self.weight) < 1:
             expected = "0 <= X < 1 (1e-4 is usual)"
-            raise UsageError("pressure", f"{self.weight:g}", expected, "Change it.")
+            raise UsageError("pressure", f"{self.weight:g}", expected, "Choose another weight.")
 
     def pressure(self, elasticity: float, itself: bool) -> PressureRule:
         """The weight; without one, fixed where there is no loss to follow, else elastic."""
@@ -181,11 +181,11 @@ def parse_goal(text: str, goals: Mapping[str, type[Goal]] = GOALS) -> Goal:
 def number(what: str, value: object) -> float:
     """A finite number; raises UsageError for anything else."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise UsageError(what, repr(value)[:80], "a number", "Correct it.")
+        raise UsageError(what, repr(value)[:80], "a finite number", "Pass a number.")
     return value
 
 
 def expect(what: str, value: float, above: float, most: float, expected: str) -> None:
     """Raise UsageError unless a number is above one and at most another."""
     if not above < number(what, value) <= most:
-        raise UsageError(what, f"{value:g}", expected, "Choose another.")
+        raise UsageError(what, f"{value:g}", expected, "Choose another number.")

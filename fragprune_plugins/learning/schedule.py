@@ -100,7 +100,7 @@ class Settings:
         for name, fits, expected in checks:
             if not fits(value := getattr(self, name)):
                 where = name.replace("_", " ")
-                raise UsageError(where, repr(value)[:80], expected, "Correct it.")
+                raise UsageError(where, repr(value)[:80], expected, "Correct this setting.")
         if not self.goal.on_area:
             return
         model, remedy = f"a {self.goal.name} model", "Drop one of the two."

@@ -160,7 +160,7 @@ class ThresholdStore:
             InputError: the stop is not 1e-4 to 1, or the rim neither hard nor soft.
         """
         if not is_stop(stop):
-            raise InputError("stop", f"{stop:g}", "1e-4 to 1", "Choose another.")
+            raise InputError("stop", f"{stop:g}", "1e-4 to 1, a share of light", "Choose another.")
         if rim is not None and not is_rim(rim):
             raise InputError("rim", f"{rim!r:.40}", "hard or soft", "Choose one of the two.")
         self.stop = self.stop if stop is None else stop

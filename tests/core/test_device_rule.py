@@ -56,8 +56,8 @@ def test_a_gpu_that_is_not_used_is_spoken_of(gpus, caplog):
 @pytest.mark.parametrize(
     ("count", "wanted", "engine", "words"),
     [
-        (0, "cuda", "auto", "no CUDA devices; expected that one"),
-        (1, "cuda:1", "auto", "1 CUDA device; expected that one"),
+        (0, "cuda", "auto", "no CUDA devices; expected cuda, as torch sees it"),
+        (1, "cuda:1", "auto", "1 CUDA device; expected cuda:1, as torch sees it"),
         (1, "cuda", "cpu", "--engine cpu"),
         (1, "cpu", "cuda", "--engine cuda"),
     ],
