@@ -167,67 +167,45 @@ def _second_length(array: Tensor | None) -> int:
 
 # ---- gradients ---------------------------------------------------------------------------------
 
-_DIFFERENTIABLE = frozenset(
-    ("image", "invdepth", "alpha", "features", "surface", "fragments_per_pixel")
-)
 _LEARNABLE = tuple(name for name, *_ in binding.InputGrads._fields_[1:])
+_DIFFERENTIABLE = ("image", "invdepth", "alpha", "features", "surface", "fragments_per_pixel")
+_FELT_BY = dict.fromkeys(_DIFFERENTIABLE, frozenset(_LEARNABLE))
+
+Draw = Callable[[Wanted], Mapping[str, Tensor]]
+"""A forward pass: the outputs by name."""
 
 Undraw = Callable[[Wanted, dict[str, Tensor]], dict[str, Tensor]]
 """A backward pass, from gradients of outputs to gradients of the wanted inputs, by name."""
 
 
 def with_gradients(
-    inputs: RasterInputs,
-    thresholds: Tensor | None,
-    draw: Callable[[Wanted], Mapping[str, Tensor]],
-    undraw: Undraw,
+    inputs: RasterInputs, thresholds: Tensor | None, draw: Draw, undraw: Undraw
 ) -> dict[str, Any]:
-    """Draw in torch's graph.
-
-    Args:
-        draw: the forward pass; it gives tensors by their names in ``RasterOutputs``.
-        undraw: the backward pass.
-
-    Returns:
-        What ``draw`` gave, differentiable where that makes sense.
-    """
+    """Draw in torch's graph, tensors by their names in ``RasterOutputs``."""
     given = vars(inputs.splats) | {"hook": inputs.means2d_hook, "thresholds": thresholds}
     given["background"] = inputs.view.background
     tensors = {name: given[name] for name in _LEARNABLE if given.get(name) is not None}
-
-    def forward(wanted: Wanted) -> tuple[Mapping[str, Tensor], Collection[str]]:
-        drawn = draw(wanted)
-        return drawn, drawn.keys() - _DIFFERENTIABLE
-
-    return in_graph(tensors, forward, undraw)
+    return in_graph(tensors, draw, undraw, _FELT_BY)
 
 
 def in_graph(
-    tensors: Mapping[str, Tensor],
-    forward: Callable[[Wanted], tuple[Mapping[str, Tensor], Collection[str]]],
-    backward: Undraw,
+    tensors: Mapping[str, Tensor], draw: Draw, undraw: Undraw, felt_by: Mapping[str, Wanted]
 ) -> dict[str, Tensor]:
     """Run compiled code in torch's graph, where it can be differentiated once.
 
     Args:
         tensors: what may want gradients, by name; on any device and of any floating type.
-        forward: gives the outputs by name, and the names of those that have no gradient.
-        backward: from and to tensors on the compiled code's own device.
+        felt_by: by an output's name, the inputs that it depends on. One that depends on none whose
+            gradients are wanted gets no gradient.
 
     Returns:
-        The outputs.
+        What ``draw`` gave.
     """
     if not torch.is_grad_enabled():  # the function would be told that parameters want theirs
         tensors = {name: each.detach() for name, each in tensors.items()}
-    names: list[str] = []
-
-    def named(wanted: Wanted) -> tuple[Mapping[str, Tensor], Collection[str]]:
-        made, constant = forward(wanted)
-        names.extend(made)
-        return made, constant
-
-    made = _Compiled.apply(named, backward, tuple(tensors), *tensors.values())  # type: ignore[no-untyped-call]
-    return dict(zip(names, made, strict=True))
+    made: list[str] = []  # the outputs' names
+    outputs = _Compiled.apply((draw, undraw, felt_by), made, tuple(tensors), *tensors.values())  # type: ignore[no-untyped-call]
+    return dict(zip(made, outputs, strict=True))
 
 
 class _Compiled(torch.autograd.Function):
@@ -235,17 +213,20 @@ class _Compiled(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, forward: Any, backward: Any, names: tuple[str, ...], *tensors: Tensor
+        ctx: Any, code: Any, made: list[str], names: tuple[str, ...], *tensors: Tensor
     ) -> tuple[Tensor, ...]:
+        draw, ctx.undraw, felt_by = code
         needed = zip(names, ctx.needs_input_grad[3:], strict=True)
-        ctx.wanted = frozenset(name for name, needs in needed if needs)
-        made, constant = forward(ctx.wanted)
-        ctx.mark_non_differentiable(*(made[name] for name in constant))
+        wanted = frozenset(name for name, needs in needed if needs)
+        outputs = draw(wanted)
+        made.extend(outputs)
+        constant = [each for name, each in outputs.items() if not wanted & felt_by.get(name, set())]
+        ctx.mark_non_differentiable(*constant)
         ctx.set_materialize_grads(False)
-        ctx.undraw, ctx.names, ctx.made = backward, names, tuple(made)
+        ctx.wanted, ctx.names, ctx.made = wanted, names, made
         # Saved for the sake of autograd's check against changes in place: ``undraw`` reads these.
         ctx.save_for_backward(*tensors)
-        return tuple(made.values())
+        return tuple(outputs.values())
 
     @staticmethod
     @once_differentiable

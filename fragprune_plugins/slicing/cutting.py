@@ -221,15 +221,14 @@ def slice_by(kernels: SliceKernels, splats: SpacetimeSplats, moment: Moment) -> 
     )
     present = torch.empty(n, dtype=torch.bool, device=kernels.where)
 
-    def forward(wanted: Wanted) -> tuple[dict[str, Tensor], set[str]]:
+    def forward(wanted: Wanted) -> dict[str, Tensor]:
         made = {"means": (n, 3), "cov3d": (n, 6), "opacities": (n,)}
         made |= {} if sh is None else {"colors": (n, 3)}
         cut = {name: kernels.empty(*shape) for name, shape in made.items()} | {"present": present}
         kernels.call(
             "slice", given, structs.Sliced(**{k: address(each) for k, each in cut.items()})
         )
-        idle = {name for name in made if not wanted & _FELT_BY[name]}
-        return cut, {"present", *idle}
+        return cut
 
     def backward(wanted: Wanted, by: dict[str, Tensor]) -> dict[str, Tensor]:
         by = {name: plain(grad, kernels.where) for name, grad in by.items()} | {"present": present}
@@ -242,5 +241,5 @@ def slice_by(kernels: SliceKernels, splats: SpacetimeSplats, moment: Moment) -> 
         )
         return grads
 
-    cut = in_graph(held, forward, backward)
+    cut = in_graph(held, forward, backward, _FELT_BY)
     return Sliced(**{name: each.to(splats.device) for name, each in cut.items()})
