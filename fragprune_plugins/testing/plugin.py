@@ -42,7 +42,8 @@ def pytest_itemcollected(item: pytest.Item) -> None:
 
 def results_of(stats: dict[str, list[Any]]) -> list[dict[str, Any]]:
     """What became of the kit's tests, in their order: outcomes of tests, and of failed set-ups."""
-    reports = [each for kind in stats.values() for each in kind if hasattr(each, "user_properties")]
+    kept = (each for kind in stats.values() for each in kind)  # items and warnings are among them
+    reports = [each for each in kept if isinstance(each, pytest.TestReport)]
     results = []
     for report in sorted(reports, key=lambda each: each.start):
         properties = dict(report.user_properties)
