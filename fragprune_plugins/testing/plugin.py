@@ -46,7 +46,7 @@ def results_of(stats: dict[str, list[Any]]) -> list[dict[str, Any]]:
     reports = [each for each in kept if isinstance(each, pytest.TestReport)]
     results = []
     for report in sorted(reports, key=lambda each: each.start):
-        properties = dict(report.user_properties)
+        properties: dict[str, Any] = dict(report.user_properties)
         if WHAT not in properties or (report.when != "call" and report.passed):
             continue
         adapter, host, invariant = properties[WHAT]
