@@ -16,7 +16,7 @@ from fragprune_plugins.hosts.seams import Role
 from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.testing import Host, invariants
 from fragprune_plugins.testing.fresh import FreshProcessError, NotApplicable, fresh
-from fragprune_plugins.testing.plugin import table
+from fragprune_plugins.testing.plugin import NOT_APPLICABLE, WHAT, results_of, table
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 
@@ -131,6 +131,28 @@ def test_the_table_has_adapters_down_and_invariants_across():
         ["adapter", "host", "freeze", "alignment"],
         ["one", "miniature", "ok", "FAILED"],
         ["another", "checkout", "skipped", "n/a"],
+    ]
+
+
+def test_the_tables_results_are_the_reports_of_the_kit_in_the_order_of_its_tests(request):
+    def report(invariant, outcome, start, when="call", reason=None):
+        about = [(WHAT, ["one", "miniature", invariant])] if invariant else []
+        given = ("file::test", ("file", 1, "test"), {}, outcome, reason, when)
+        return pytest.TestReport(*given, duration=1.25, start=start, user_properties=about)
+
+    absent = ("file", 1, f"Skipped: {NOT_APPLICABLE}it has none")
+    stats = {
+        "": [report("freeze", "passed", 1.0, "setup")],
+        "passed": [report("freeze", "passed", 2.0), report("", "passed", 0.0)],
+        "skipped": [report("checkpoint", "skipped", 1.5, "setup", absent)],
+        "failed": [report("refuse", "failed", 0.5, reason="E   it fits")],
+        "deselected": [request.node],
+    }
+    found = [[each[k] for k in ("invariant", "outcome", "reason")] for each in results_of(stats)]
+    assert found == [
+        ["refuse", "failed", "E   it fits"],
+        ["checkpoint", "n/a", "it has none"],
+        ["freeze", "passed", ""],
     ]
 
 
