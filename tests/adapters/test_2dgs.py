@@ -5,7 +5,7 @@ import torch
 from cli.commands import run_json
 from miniatures.runs import OPTIONS, check_measured, command, miniature
 from miniatures.surfels import SurfelHost
-from miniatures.vanilla_3dgs import Notes, joint
+from miniatures.vanilla_3dgs import joint
 
 from fragprune_2dgs import SurfelSplatting
 from fragprune_plugins import Portable, Settings
@@ -14,6 +14,7 @@ from fragprune_plugins.errors import InputError, UsageError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection import process
 from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.testing.invariants.case import FixedThresholds
 from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.run.work import photographs_of
 
@@ -27,7 +28,7 @@ mini, of = miniature(SurfelHost, SurfelSplatting, driver=SurfelHost)
 
 
 def test_the_hosts_maps_are_those_of_the_oracle_in_its_order(mini):
-    notes = Notes()
+    notes = FixedThresholds()
     with joint(**of(mini, plugins=[notes])) as host:
         model, camera = host.model(COUNT), host.camera(20, 14)
         host.step(model, camera, 1)

@@ -12,7 +12,6 @@ import pytest
 import torch
 from miniatures import runs
 from miniatures.moving import MovingHost
-from miniatures.vanilla_3dgs import Notes
 from scenes import blended
 
 from fragprune_4dgaussians import MovingGaussians
@@ -22,6 +21,7 @@ from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection.launch import run
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.testing.host import joint, running
+from fragprune_plugins.testing.invariants.case import FixedThresholds
 from fragprune_plugins.workbench.models import model as models
 
 LAST = 20
@@ -307,7 +307,7 @@ def test_rates_that_the_host_sets_in_every_iteration_stay_its_own(mini):
 
 
 def test_depth_is_the_sum_of_blended_depths_and_has_no_gradient(mini):
-    notes = Notes()
+    notes = FixedThresholds()
     with joint(plugins=[notes], **of(mini, engine="reference")) as host:
         model, camera = host.model(16), host.camera()
         host.store(model).open(host.adapter.opacities(model))

@@ -12,7 +12,7 @@ import torch
 from miniatures import runs
 from miniatures.light_gaussian import LightGaussianHost
 from miniatures.runs import OPTIONS, check_stage_two, frozen_differences, miniature
-from miniatures.vanilla_3dgs import Notes, expect_ancestors, joint, label, running
+from miniatures.vanilla_3dgs import expect_ancestors, joint, label, running
 from oracle import naive
 
 from fragprune_light_gaussian import LightGaussian
@@ -21,6 +21,7 @@ from fragprune_plugins.files import sidecar
 from fragprune_plugins.hosts.adapter import optimizer_state
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.testing.invariants.case import FixedThresholds
 
 COUNT = 16
 
@@ -44,7 +45,7 @@ def brute_force(inputs, thresholds):
 @pytest.mark.parametrize("truncated", [False, True], ids=["whole", "truncated"])
 @pytest.mark.parametrize("size", [(24, 18), (33, 17)])
 def test_both_forms_of_the_call_against_brute_force(mini, truncated, size):
-    notes = Notes()
+    notes = FixedThresholds()
     with joint(**of(mini, plugins=[notes])) as host:
         model, camera = host.model(COUNT), host.camera(*size)
         host.step(model, camera, 1)

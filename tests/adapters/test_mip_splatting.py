@@ -13,12 +13,13 @@ from miniatures.runs import (
     frozen_differences,
     miniature,
 )
-from miniatures.vanilla_3dgs import Notes, joint, label, running
+from miniatures.vanilla_3dgs import joint, label, running
 
 from fragprune_mip_splatting import MipSplatting
 from fragprune_plugins.adapting import HostRepo, NotComparedError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.testing.invariants.case import FixedThresholds
 
 COUNT = 16
 
@@ -30,7 +31,7 @@ mini, of = miniature(MipHost, MipSplatting, driver=MipHost)
 
 
 def test_filters_and_offsets_reach_the_engine(mini):
-    notes = Notes()
+    notes = FixedThresholds()
     with joint(**of(mini, plugins=[notes])) as host:
         model, camera = host.model(COUNT), host.camera(20, 14)
         host.step(model, camera, 1)

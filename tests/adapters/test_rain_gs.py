@@ -10,12 +10,13 @@ import torch
 from miniatures import runs
 from miniatures.rain_gs import RainHost
 from miniatures.runs import OPTIONS, check_stage_two, miniature
-from miniatures.vanilla_3dgs import Notes, joint
+from miniatures.vanilla_3dgs import joint
 from scenes import blended
 
 from fragprune_plugins.adapting import HostRepo, read_ply
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.testing.invariants.case import FixedThresholds
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.run.work import measure_models, photographs_of
 from fragprune_rain_gs import PACKAGE, RainGS
@@ -30,7 +31,7 @@ mini, of = miniature(RainHost, RainGS, driver=RainHost)
 
 
 def test_dilation_reaches_the_engine_and_blended_depth_comes_back_without_a_gradient(mini):
-    notes = Notes()
+    notes = FixedThresholds()
     with joint(**of(mini, plugins=[notes])) as host:
         model, camera = host.model(COUNT), host.camera(20, 14)
         host.store(model).open(host.adapter.opacities(model))

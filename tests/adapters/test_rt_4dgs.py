@@ -18,6 +18,7 @@ from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.slicing import cutting
 from fragprune_plugins.slicing.cutting import slice_at
 from fragprune_plugins.testing.host import joint, running
+from fragprune_plugins.testing.invariants.case import FixedThresholds
 from fragprune_rt_4dgs import RT4DGS, neighbours
 from fragprune_rt_4dgs.config import YAMLFile
 from fragprune_rt_4dgs.dialect import RT4DGSDialect
@@ -32,17 +33,6 @@ mini, options_of = miniature(RT4DGSHost, RT4DGS)
 
 def of(mini, driver=None, **options):
     return options_of(mini, driver=driver or RT4DGSHost(), engine="reference", **options)
-
-
-class Notes:
-    """Answers with fixed thresholds where it holds some, and remembers what was rasterized."""
-
-    values = None
-
-    @hookimpl(tryfirst=True)
-    def fragprune_truncate(self, inputs, store):
-        self.inputs = inputs
-        return self.values
 
 
 # -- the call --------------------------------------------------------------------------------------
@@ -64,7 +54,7 @@ def spread_out(model):
 @pytest.mark.parametrize("driver", HOSTS.values(), ids=HOSTS)
 def test_the_six_outputs_against_their_definitions(mini, driver):
     """Depth, alpha and flow drawn as colours by the oracle, in double precision."""
-    notes = Notes()
+    notes = FixedThresholds()
     with joint(plugins=[notes], **of(mini, driver())) as host:
         model, camera = spread_out(host.model(COUNT)), host.camera()
         host.store(model).open(host.adapter.opacities(model))
@@ -145,8 +135,7 @@ def test_slicing_in_python_draws_the_same_with_the_same_thresholds(mini):
     """Two ways of the host to one picture: rows picked by us, or by nobody."""
     pictures = []
     for driver in (RT4DGSHost(), PythonHost()):
-        notes = Notes()
-        notes.values = torch.linspace(0.02, 0.6, COUNT)
+        notes = FixedThresholds(torch.linspace(0.02, 0.6, COUNT))
         with joint(plugins=[notes], **of(mini, driver)) as host:
             model = spread_out(host.model(COUNT))
             model.active_sh_degree = 0  # the host's Python draws directions to the moved means

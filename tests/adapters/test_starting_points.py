@@ -113,12 +113,6 @@ def test_training_again_over_a_result_of_stage_two_makes_it_stage_ones(photograp
     assert f"iteration 17, {out / ply(17)}:" in started(out, 17)
 
 
-def test_a_checkpoint_goes_before_the_ply_of_its_iteration(photographs, tmp_path, started):
-    words = command(photographs, tmp_path, 10, "--checkpoint_iterations", 10)
-    run(words, replace(OPTIONS, stage="off"))
-    assert f"{tmp_path / 'chkpnt10.pth'}:" in started(tmp_path, 10)
-
-
 def test_a_later_ply_goes_before_an_early_checkpoint(photographs, tmp_path, started):
     words = command(photographs, tmp_path, 10, "--checkpoint_iterations", 5)
     run(words, replace(OPTIONS, stage="off"))

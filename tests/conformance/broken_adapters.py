@@ -1,5 +1,7 @@
 """Adapters with one fault each, which the conformance kit must find."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -7,7 +9,8 @@ import torch
 
 from fragprune_graphdeco import GraphdecoDialect
 from fragprune_graphdeco.adapter import completed
-from fragprune_plugins.adapting import CHECKPOINT_KEY, Role, revised
+from fragprune_mcmc import MCMC, following_copies
+from fragprune_plugins.adapting import CHECKPOINT_KEY, Role, RowTrace, revised
 from fragprune_plugins.hosts.findings import Match
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
@@ -82,6 +85,41 @@ class LeavesItsRates(Vanilla3DGS):
 
     def prepare_stage2(self, model: Any, output: Any) -> None:
         model.optimizer.param_groups[3]["lr"] = 1e-3
+
+
+class LetsItGrow(Vanilla3DGS):
+    """Holds back no densification in stage 2."""
+
+    seams = revised(Vanilla3DGS.seams, {"GaussianModel.densify_and_prune": None})
+
+
+class LetsItReset(Vanilla3DGS):
+    """Holds back no reset of opacities in stage 2."""
+
+    seams = revised(Vanilla3DGS.seams, {"GaussianModel.reset_opacity": None})
+
+
+@contextmanager
+def inherited(call: Any) -> Iterator[RowTrace]:
+    with following_copies(call) as trace:
+        yield trace
+    if trace.fresh is not None:  # some rows were copied
+        trace.fresh = torch.zeros_like(trace.fresh)
+
+
+class LetsMomentsBeInherited(MCMC):
+    """Gives copies their parents' moments."""
+
+    seams = tuple(
+        replace(seam, how=inherited) if seam.role is Role.REARRANGE else seam for seam in MCMC.seams
+    )
+
+
+class ReadsNoSource(Vanilla3DGS):
+    """Takes any call of the rasterizer for the one it answers."""
+
+    def fingerprint(self, repo: Any) -> list[Any]:
+        return []
 
 
 class FitsEverything(Vanilla3DGS):

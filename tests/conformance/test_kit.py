@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from conformance import broken_adapters as broken
+from miniatures.mcmc import MCMCHost
 from miniatures.vanilla_3dgs import HOST
 
 from fragprune_plugins import testing
@@ -36,7 +37,10 @@ def case(adapter, **options):
         (invariants.checkpoint, broken.LeavesItsRates, "resumed, rates are"),
         (invariants.freeze, broken.TrainsTooMuch, "moved ['opacity', 'scaling']"),
         (invariants.freeze, broken.LeavesParametersAsleep, "left other parameters asking"),
+        (invariants.freeze, broken.LetsItGrow, "densify and prune made "),
+        (invariants.freeze, broken.LetsItReset, "reset opacity changed opacity"),
         (invariants.refuse, broken.FitsEverything, "still taken for the host"),
+        (invariants.refuse, broken.ReadsNoSource, "takes one value more"),
         (invariants.same_picture, broken.DrawsOtherwiseEachTime, "other fragments drawn"),
     ],
     ids=lambda value: getattr(value, "__name__", "words"),
@@ -45,6 +49,13 @@ def test_each_fault_is_found_by_its_invariant(check, adapter, words):
     with pytest.raises(FreshProcessError) as caught:
         fresh(check, case(adapter(), examples=1))
     assert words in str(caught.value)
+
+
+def test_two_rows_with_the_moments_of_one_are_found(tmp_path):
+    MCMCHost().write(tmp_path)
+    inheriting = invariants.Case(broken.LetsMomentsBeInherited(), MCMCHost(), tmp_path, examples=1)
+    with pytest.raises(FreshProcessError, match="two rows have the moments of one"):
+        fresh(invariants.alignment, inheriting)
 
 
 def test_a_host_that_forgets_to_be_followed_is_found():

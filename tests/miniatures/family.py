@@ -1,5 +1,6 @@
 """What miniatures of the family share: the demo's host, otherwise where a descendant says so."""
 
+import copy
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -29,6 +30,16 @@ def adding(passage: str, *, before: str = "", after: str = "") -> tuple[str, str
 def parsing(*flags: str) -> tuple[str, str]:
     """The change of a script that adds flags, given as ``add_argument`` takes them."""
     return adding(PARSE, before="".join(f"    parser.add_argument({flag})\n" for flag in flags))
+
+
+class Timed:
+    """A view and its moment, by the name that the host has for it; every use may be a copy."""
+
+    def __init__(self, camera, **moment):
+        vars(self).update(vars(camera) | moment)
+
+    def cuda(self):
+        return copy.deepcopy(self)
 
 
 class Descendant(Host):

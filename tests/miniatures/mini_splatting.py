@@ -166,59 +166,6 @@ from urllib.error import URLError
 def lpips(x, y, net_type="alex", version="0.1"):
     raise URLError("no way there")
 '''
-COMPRESSION = '''"""Sort and thin a finished model, store it, read it again and draw it."""
-import os
-import sys
-from argparse import ArgumentParser
-from pathlib import Path
-
-import numpy as np
-import torch
-
-sys.path.append(str(Path(__file__).resolve().parents[1]))
-from arguments import ModelParams, PipelineParams, get_combined_args
-from gaussian_renderer import render
-from scene import GaussianModel, Scene
-
-NAMES = ("_features_dc", "_features_rest", "_scaling", "_rotation", "_opacity")
-
-
-def compress(dataset, iteration):
-    model = GaussianModel(dataset.sh_degree)
-    scene = Scene(dataset, model, load_iteration=iteration, shuffle=False)
-    folder = os.path.join(scene.model_path, "point_cloud", f"iteration_{iteration}", "compressed")
-    os.makedirs(folder, exist_ok=True)
-    place = model._xyz.detach()
-    voxels = torch.round((place - place.min()) / (place.max() - place.min()) * 12)
-    _, rows = np.unique(voxels.numpy(), axis=0, return_index=True)
-    rest = [getattr(model, name).detach()[rows].numpy() for name in NAMES]
-    np.savez_compressed(folder + "/compressed_gs.npz", place[rows].numpy(), *rest)
-
-
-def decompress(dataset, iteration, pipe):
-    model = GaussianModel(dataset.sh_degree)
-    scene = Scene(dataset, model, shuffle=False)
-    folder = os.path.join(scene.model_path, "point_cloud", f"iteration_{iteration}", "compressed")
-    data = np.load(folder + "/compressed_gs.npz")
-    model._xyz = torch.tensor(data["arr_0"])
-    for index, name in enumerate(NAMES, 1):
-        setattr(model, name, torch.tensor(data[f"arr_{index}"]))
-    model.active_sh_degree = dataset.sh_degree
-    pictures = [
-        render(camera, model, pipe, torch.zeros(3))["render"] for camera in scene.getTestCameras()
-    ]
-    torch.save(torch.stack(pictures), os.path.join(scene.model_path, "decompressed.pt"))
-
-
-if __name__ == "__main__":
-    parser = ArgumentParser()
-    model, pipeline = ModelParams(parser, sentinel=True), PipelineParams(parser)
-    parser.add_argument("--iteration", default=30_000, type=int)
-    args = get_combined_args(parser)
-    with torch.no_grad():
-        compress(model.extract(args), args.iteration)
-        decompress(model.extract(args), args.iteration, pipeline.extract(args))
-'''
 
 
 class MiniSplattingHost(Descendant):
@@ -227,7 +174,7 @@ class MiniSplattingHost(Descendant):
     routine = ("densify by mask", "new points", "simplify", "reset opacity", "another band")
     changes = {TRAIN: [PATH]}
     added = Added
-    files = {"ms_c/run.py": COMPRESSION, "lpipsPyTorch/__init__.py": LPIPS}
+    files = {"lpipsPyTorch/__init__.py": LPIPS}
 
     def write(self, root: Path) -> None:
         super().write(root)

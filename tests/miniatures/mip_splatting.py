@@ -1,5 +1,6 @@
 """A miniature Mip-Splatting: the demo's host with what the method adds, from its interface."""
 
+import copy
 import math
 from importlib import import_module
 from pathlib import Path
@@ -7,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.lib.recfunctions import append_fields
 from plyfile import PlyData, PlyElement
 
 from miniatures.family import MODEL, RENDERER, STEP, TRAIN, Descendant, adding
@@ -69,29 +71,17 @@ class Added:
         new = inverse_sigmoid(low.detach())  # noqa: F821
         self._opacity = self.replace_tensor_to_optimizer(new, "opacity")["opacity"]
 
-    def _table(self, opacity, scaling, more=()):
-        columns = [
-            self._xyz,
-            torch.zeros_like(self._xyz),
-            self._features_dc.transpose(1, 2).flatten(1),
-            self._features_rest.transpose(1, 2).flatten(1),
-            *(opacity, scaling, self._rotation, *more),
-        ]
-        return torch.cat(columns, dim=1).detach().cpu().numpy()
-
-    def _write(self, path, table, names):
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
-        rows = np.ascontiguousarray(table).view([(name, "f4") for name in names])[:, 0]
+    def save_ply(self, path):
+        self.vanilla_save_ply(path)
+        filters = self.filter_3D.cpu().numpy()[:, 0]
+        rows = append_fields(PlyData.read(path)["vertex"].data, "filter_3D", filters, usemask=False)
         PlyData([PlyElement.describe(rows, "vertex")]).write(path)
 
-    def save_ply(self, path):
-        table = self._table(self._opacity, self._scaling, [self.filter_3D])
-        self._write(path, table, [*self.construct_list_of_attributes(), "filter_3D"])
-
     def save_fused_ply(self, path):
-        opacity = inverse_sigmoid(self.get_opacity_with_3D_filter)  # noqa: F821
-        table = self._table(opacity, self.get_scaling_with_3D_filter.log())
-        self._write(path, table, self.construct_list_of_attributes())
+        fused = copy.copy(self)
+        fused._opacity = inverse_sigmoid(self.get_opacity_with_3D_filter)  # noqa: F821
+        fused._scaling = self.get_scaling_with_3D_filter.log()
+        fused.vanilla_save_ply(path)
 
     def load_ply(self, path):
         self.vanilla_load_ply(path)
@@ -142,7 +132,11 @@ class MipHost(Descendant):
             ("opacities=pc.get_opacity,", "opacities=pc.get_opacity_with_3D_filter,"),
         ],
         MODEL: [
-            adding("import numpy as np\n", before="import math\n\n"),
+            adding(
+                "import numpy as np\n",
+                before="import copy\nimport math\n\n",
+                after="from numpy.lib.recfunctions import append_fields\n",
+            ),
             adding("        self.densify_and_clone(grads, max", before=QUANTILE),
             *(
                 (f"{way}(grads, max_grad, extent)", f"{way}(grads, max_grad, {ABSOLUTE}, extent)")

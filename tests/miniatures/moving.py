@@ -20,6 +20,7 @@ from miniatures.family import (
     SCENE,
     TRAIN,
     Descendant,
+    Timed,
     adding,
 )
 
@@ -47,29 +48,18 @@ class Added:
 
     def training_setup(self, training_args):
         self.vanilla_training_setup(training_args)
-        given, extent = vars(training_args), self.spatial_lr_scale
-        own = {
-            "deformation": list(self._deformation.get_mlp_parameters()),
-            "grid": list(self._deformation.get_grid_parameters()),
-        }
-        more = [
-            {"params": own[name], "lr": given[f"{name}_lr_init"] * extent, "name": name}
-            for name in own
-        ]
+        given, extent, own = vars(training_args), self.spatial_lr_scale, []
+        self.schedules = {"xyz": self.xyz_scheduler_args}
+        for name, parameters in (
+            ("deformation", self._deformation.get_mlp_parameters()),
+            ("grid", self._deformation.get_grid_parameters()),
+        ):
+            first, last = (given[f"{name}_lr_{end}"] * extent for end in ("init", "final"))
+            steps = training_args.position_lr_max_steps
+            self.schedules[name] = get_expon_lr_func(first, last, steps)  # noqa: F821
+            own.append({"params": parameters, "lr": first, "name": name})
         xyz, *others = self.optimizer.param_groups
-        self.optimizer = torch.optim.Adam([xyz, *more, *others], lr=0.0, eps=1e-15)
-        self.schedules = {
-            name: get_expon_lr_func(  # noqa: F821
-                given[f"{rate}_lr_init"] * extent,
-                given[f"{rate}_lr_final"] * extent,
-                training_args.position_lr_max_steps,
-            )
-            for name, rate in {
-                "xyz": "position",
-                "deformation": "deformation",
-                "grid": "grid",
-            }.items()
-        }
+        self.optimizer = torch.optim.Adam([xyz, *own, *others], lr=0.0, eps=1e-15)
 
     def update_learning_rate(self, iteration):
         for group in self.optimizer.param_groups:
@@ -77,16 +67,16 @@ class Added:
                 group["lr"] = self.schedules[group["name"]](iteration)
 
     def save_deformation(self, path):
-        torch.save(self._deformation.state_dict(), Path(path) / "deformation.pth")  # noqa: F821
-        torch.save(self._deformation_table, Path(path) / "deformation_table.pth")  # noqa: F821
-        torch.save(self._deformation_accum, Path(path) / "deformation_accum.pth")  # noqa: F821
+        parts = (self._deformation.state_dict(), self._deformation_table, self._deformation_accum)
+        for name, part in zip(("", "_table", "_accum"), parts, strict=True):
+            torch.save(part, f"{path}/deformation{name}.pth")
 
     def load_model(self, path):
-        names = ("deformation", "deformation_table", "deformation_accum")
-        files = [Path(path) / f"{name}.pth" for name in names]  # noqa: F821
-        network, table, accumulated = (torch.load(file, map_location="cuda") for file in files)
+        network, self._deformation_table, self._deformation_accum = (
+            torch.load(f"{path}/deformation{name}.pth", map_location="cuda")
+            for name in ("", "_table", "_accum")
+        )
         self._deformation.load_state_dict(network)
-        self._deformation_table, self._deformation_accum = table, accumulated
 
     def _reset_statistics(self):
         self.vanilla_reset_statistics()
@@ -102,17 +92,7 @@ class Added:
         for tensor in (*(getattr(self, name) for name in names), self._deformation_table):
             yield tensor[chosen].repeat(copies, *[1] * (tensor.ndim - 1))
 
-    def densify_and_clone(
-        self,
-        grads,
-        grad_threshold,
-        scene_extent,
-        density_threshold=20,
-        displacement_scale=20,
-        model_path=None,
-        iteration=None,
-        stage=None,
-    ):
+    def densify_and_clone(self, grads, grad_threshold, scene_extent, *_):
         chosen = self._needy(grads, grad_threshold, scene_extent, large=False)
         self.densification_postfix(*self._rows(chosen))
 
@@ -126,18 +106,7 @@ class Added:
         children = torch.zeros(len(xyz), dtype=torch.bool)
         self.prune_points(torch.cat((chosen, children)))
 
-    def densify(
-        self,
-        max_grad,
-        min_opacity,
-        extent,
-        max_screen_size,
-        density_threshold,
-        displacement_scale,
-        model_path=None,
-        iteration=None,
-        stage=None,
-    ):
+    def densify(self, max_grad, min_opacity, extent, max_screen_size, *_):
         grads = (self.xyz_gradient_accum / self.denom).nan_to_num(0.0)
         self.densify_and_clone(grads, max_grad, extent)
         self.densify_and_split(grads, max_grad, extent)
@@ -214,14 +183,6 @@ CHOICE = """    else:
 """
 
 
-class Timed:
-    """A view and its moment."""
-
-    def __init__(self, camera, time):
-        vars(self).update(vars(camera))
-        self.time = time
-
-
 def scene_reconstruction(opt, pipe, gaussians, scene, stage, train_iter, white):
     """One phase: it counts from 1, and saves under its own names."""
     iteration = 0
@@ -233,7 +194,7 @@ def scene_reconstruction(opt, pipe, gaussians, scene, stage, train_iter, white):
             model_params, iteration = torch.load(args.start_checkpoint)  # noqa: F821
             gaussians.restore(model_params, opt)
     cameras = scene.getTrainCameras()
-    views = [Timed(view, number / len(cameras)) for number, view in enumerate(cameras)]
+    views = [Timed(view, time=number / len(cameras)) for number, view in enumerate(cameras)]
     background = torch.full((3,), float(white))
     waiting = []
     for iteration in range(iteration + 1, train_iter + 1):  # noqa: B020
@@ -426,7 +387,7 @@ class MovingHost(Descendant):
         return import_module("scene.gaussian_model").GaussianModel(degree, hidden)
 
     def camera(self, width, height, *, side=0.0):
-        return Timed(super().camera(width, height, side=side), self.moment)
+        return Timed(super().camera(width, height, side=side), time=self.moment)
 
     def gather(self, model, package):
         moved = package["viewspace_points"].grad

@@ -1,13 +1,12 @@
 """A miniature RT-4DGS: the demo's host with space and time, from the method's interface."""
 
-import copy
 from importlib import import_module
 from types import SimpleNamespace
 
 import torch
 
 from fragprune_plugins.testing.host import Chance
-from miniatures.family import MODEL, PARSE, RENDERER, SCENE, TRAIN, Descendant, adding
+from miniatures.family import MODEL, PARSE, RENDERER, SCENE, TRAIN, Descendant, Timed, adding
 
 ATTRIBUTES = {
     "xyz": "_xyz",
@@ -281,17 +280,6 @@ RENDERING = [
 args = SimpleNamespace()  # the host's script holds its options under this name
 
 
-class Timed:
-    """A view and its moment; every use of it is a copy."""
-
-    def __init__(self, camera, timestamp):
-        vars(self).update(vars(camera))
-        self.timestamp = timestamp
-
-    def cuda(self):
-        return copy.deepcopy(self)
-
-
 def training(dataset, opt, pipe):
     """The loop: the first iteration is 2, the model is saved before it changes."""
     prepare_output_and_logger(dataset)  # noqa: F821
@@ -313,7 +301,7 @@ def training(dataset, opt, pipe):
         gaussians.env_map = torch.nn.Parameter(torch.zeros(3, size, size))
         optimizer = torch.optim.Adam([gaussians.env_map], lr=opt.feature_lr)
     cameras = scene.getTrainCameras()
-    views = [Timed(view, number / len(cameras)) for number, view in enumerate(cameras)]
+    views = [Timed(view, timestamp=number / len(cameras)) for number, view in enumerate(cameras)]
     background = torch.zeros(3)
     loader = torch.utils.data.DataLoader(
         views, batch_size=args.batch_size, shuffle=True, collate_fn=list, drop_last=True
@@ -431,7 +419,7 @@ class RT4DGSHost(Descendant):
         model.create_from_pcd(cloud, 1.0)
 
     def camera(self, width, height, *, side=0.0):
-        return Timed(super().camera(width, height, side=side), 0.1)
+        return Timed(super().camera(width, height, side=side), timestamp=0.1)
 
     def pipe(self):
         pipe = super().pipe()

@@ -16,7 +16,7 @@ def surface(viewpoint_camera, allmap, pipe):
     expected = torch.nan_to_num(allmap[0:1] / alpha, 0, 0)
     median = torch.nan_to_num(allmap[5:6], 0, 0)
     depth = expected * (1 - pipe.depth_ratio) + pipe.depth_ratio * median
-    seen = depth_to_normal(viewpoint_camera, depth).permute(2, 0, 1) * alpha.detach()
+    seen = depth_to_normal(viewpoint_camera, depth) * alpha.detach()
     return {
         "rend_alpha": alpha,
         "rend_normal": normal,
@@ -26,26 +26,16 @@ def surface(viewpoint_camera, allmap, pipe):
     }
 """
 
-POINTS = '''"""Normals of a depth map."""
-
-import math
+POINTS = '''"""Normals of a depth map, as an orthographic camera would see them."""
 
 import torch
 
 
 def depth_to_normal(view, depth):
-    """(H, W, 3) world normals of depths (1, H, W), zeros at the border."""
-    _, height, width = depth.shape
-    tan_x, tan_y = math.tan(view.FoVx / 2), math.tan(view.FoVy / 2)
-    x = torch.arange(width, device="cuda") / width * 2 - 1
-    y = torch.arange(height, device="cuda") / height * 2 - 1
-    rows, columns = torch.meshgrid(y * tan_y, x * tan_x, indexing="ij")
-    rays = torch.stack([columns, rows, torch.ones_like(rows)], dim=-1)
-    points = depth[0, :, :, None] * (rays @ view.world_view_transform[:3, :3].T)
-    across = points[2:, 1:-1] - points[:-2, 1:-1]
-    down = points[1:-1, 2:] - points[1:-1, :-2]
-    normal = torch.nn.functional.normalize(torch.cross(across, down, dim=-1), dim=-1)
-    return torch.nn.functional.pad(normal, (0, 0, 1, 1, 1, 1))
+    """(3, H, W) unit normals of depths (1, H, W)."""
+    down, across = torch.gradient(depth[0])
+    facing = torch.stack([-across, -down, torch.ones_like(down)])
+    return torch.nn.functional.normalize(facing, dim=0)
 '''
 
 

@@ -1,16 +1,12 @@
 """The demo's host in this process, under the vanilla adapter unless told otherwise."""
 
-import runpy
 import signal
-import sys
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from fragprune_plugins.hosts.adapter import HostAdapter
-from fragprune_plugins.injection.process import forget_modules, host_process
-from fragprune_plugins.injection.session import Session
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.testing import host as kit
@@ -19,14 +15,6 @@ from fragprune_plugins.testing.host import Running, expect_ancestors, imported, 
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 __all__ = ["HOST", "Running", "expect_ancestors", "imported", "label"]  # as the kit has them
-
-
-class Notes:
-    """Remembers what was rasterized."""
-
-    @hookimpl(tryfirst=True)
-    def fragprune_truncate(self, inputs: Any, store: Any) -> None:
-        self.inputs = inputs
 
 
 class InterruptAt:
@@ -61,24 +49,6 @@ def joint(
 ) -> Any:
     """The host under a session that learns from the first step and freezes nothing."""
     return kit.joint(settings, adapter=adapter or Vanilla3DGS(), **options)
-
-
-def run_script(words: list[str], session: Session, *, activated: bool) -> None:
-    """The host's script in this process, on the CPU, under a session or with its stand-ins alone.
-
-    Args:
-        words: the script and its arguments.
-        session: not active.
-        activated: False leaves it so, and installs what stands in for the host's packages.
-    """
-    known = set(sys.modules)
-    with host_process(Path(words[0]), words[1:], "cpu"):
-        try:
-            session.activate() if activated else session.stand_ins.place()
-            runpy.run_path(words[0], run_name="__main__")
-        finally:
-            session.deactivate()
-            forget_modules(HOST, known)
 
 
 def tensors(model: Any) -> dict[str, torch.Tensor]:
