@@ -11,7 +11,6 @@ from fragprune_2dgs import SurfelSplatting
 from fragprune_plugins import Portable, Settings
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import InputError, UsageError
-from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection import process
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.testing.invariants.case import FixedThresholds
@@ -99,16 +98,6 @@ def test_compare_draws_its_models_by_their_record(trained):
     records.leave(summary.model_after, "run", {"photographs": photographs_of(summary).as_dict()})
     found = run_json("compare", summary.model_before, summary.model_after)
     assert found["b"]["fragments_per_pixel"] < found["a"]["fragments_per_pixel"]
-
-
-def test_a_point_cloud_alone_is_resumed(mini, photographs, trained, tmp_path):
-    summary, _, _ = trained
-    words = command(
-        mini / "train.py", photographs, tmp_path, 28, "--start_checkpoint", summary.model_after
-    )
-    again = run(words, RunOptions(device="cpu", stage="finetune", settings=OPTIONS.settings))
-    assert sidecar.load(again.model_after)[0].steps == 16
-    assert read(again.model_after).scaling.shape[1] == 2
 
 
 def test_portable_is_refused(mini, photographs, trained, tmp_path):

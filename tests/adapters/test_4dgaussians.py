@@ -12,7 +12,6 @@ import pytest
 import torch
 from miniatures import runs
 from miniatures.moving import MovingHost
-from scenes import blended
 
 from fragprune_4dgaussians import MovingGaussians
 from fragprune_4dgaussians.config import PythonFile
@@ -21,7 +20,6 @@ from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection.launch import run
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.testing.host import joint, running
-from fragprune_plugins.testing.invariants.case import FixedThresholds
 from fragprune_plugins.workbench.models import model as models
 
 LAST = 20
@@ -304,21 +302,6 @@ def test_rates_that_the_host_sets_in_every_iteration_stay_its_own(mini):
 
 
 # -- the call --------------------------------------------------------------------------------------
-
-
-def test_depth_is_the_sum_of_blended_depths_and_has_no_gradient(mini):
-    notes = FixedThresholds()
-    with joint(plugins=[notes], **of(mini, engine="reference")) as host:
-        model, camera = host.model(16), host.camera()
-        host.store(model).open(host.adapter.opacities(model))
-        package = host.render(camera, model)
-        view, splats = notes.inputs.view, notes.inputs.splats
-        depths = splats.means @ view.viewmatrix[:3, 2] + view.viewmatrix[3, 2]
-        assert not torch.equal(splats.means, model.get_xyz)
-        expected, depth = blended(view, splats, depths.detach()), package["depth"]
-        torch.testing.assert_close(depth, expected, rtol=1e-4, atol=1e-4)
-        assert not depth.requires_grad
-        assert depth.any()
 
 
 def test_a_camera_that_is_a_dict_draws_the_same_picture(mini):

@@ -107,24 +107,6 @@ def test_every_script_is_fine_tuned_and_only_opacities_move(trained):
     assert (len(before.xyz) != 150) or variant == "gs"
 
 
-def test_a_run_without_learning_keeps_the_thresholds_of_its_checkpoint(mini, photographs, tmp_path):
-    """Simplified on, from a checkpoint of stage 2: survivors keep theirs."""
-    out, later = tmp_path / "out", ["--simp_iteration2", 40, "--checkpoint_iterations", 23]
-    summary = run(command(mini, "ms", photographs, out, 16, *later), OPTIONS)
-    before, whole = read_ply(summary.model_after), sidecar.load(summary.model_after)[0]
-    more = ["--start_checkpoint", out / "chkpnt23.pth", "--simp_iteration2", 24]
-    run(command(mini, "ms", photographs, tmp_path / "b", 25, *more), replace(OPTIONS, stage="off"))
-    model = tmp_path / "b/point_cloud/iteration_25/point_cloud.ply"
-    after, store = read_ply(model), sidecar.load(model)[0]
-    assert len(store) == len(after.xyz) < len(before.xyz)
-    where = {row.numpy().tobytes(): index for index, row in enumerate(before.f_dc)}
-    moved = {index for index, row in enumerate(after.f_dc) if row.numpy().tobytes() not in where}
-    assert len(moved) == len(after.xyz) or torch.equal(  # colours train on in this run
-        store.logits, whole.logits[[where[row.numpy().tobytes()] for row in after.f_dc]]
-    )
-    assert set(store.logits.tolist()) <= set(whole.logits.tolist())
-
-
 def test_the_metric_without_its_weights_is_said_once(mini, photographs, tmp_path, caplog):
     with caplog.at_level(logging.WARNING, logger="fragprune"):
         more = ["--test_iterations", 2, 3]

@@ -1,7 +1,10 @@
 """Mini-Splatting's render_depth against its definition, pixel by pixel and fragment by fragment."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import scenes
 import torch
 from oracle import naive
 
@@ -12,53 +15,29 @@ from fragprune_plugins.engines import create_engine
 WIDTH, HEIGHT = 37, 21
 
 
-def quaternions(count, generator):
-    rotations = generator.normal(size=(count, 4))
-    return rotations / np.linalg.norm(rotations, axis=1, keepdims=True)
-
-
 def matrix(quaternion):
     """Of a unit quaternion."""
     return np.stack([naive.rotate(quaternion.tolist(), axis) for axis in np.eye(3)], axis=1)
 
 
 def scene(seed, near):
-    """Gaussians before the camera; with ``near``, some so long that rays pass them behind it.
+    """Gaussians before a turned camera; with ``near``, some so long that rays pass them behind it.
 
     Opacities stay below 0.35: no fragment outside the 3 sigma reaches 1/255.
     """
-    generator = np.random.default_rng(seed)
-    count = 14
-    means = generator.uniform(-1, 1, (count, 3)) * (1.0, 0.6, 0.7) + (0, 0, 3)
-    scales = np.exp(generator.uniform(-2.5, -0.8, (count, 3)))
-    rotations = quaternions(count, generator)
+    inputs = scenes.random_scene(seed, 14, WIDTH, HEIGHT, colors=True)
+    splats = inputs.splats
+    splats.opacities.mul_(0.35)
     if near:
-        means[:4] = generator.uniform(-1, 1, (4, 3)) * (0.4, 0.3, 0.1) + (0, 0, 0.5)
-        scales[:4] = (1.5, 0.05, 0.05)
-        turn = np.array([0.5, 0.65, 0.8, 0.95])  # about the y axis, nearly along the view
-        rotations[:4] = np.stack([np.cos(turn), 0 * turn, np.sin(turn), 0 * turn], axis=1)
-    return means, scales, rotations, generator.uniform(0.05, 0.35, count)
-
-
-def inputs_of(means, scales, rotations, opacities, colours):
-    turn = torch.from_numpy(matrix(np.array([0.96, 0.1, -0.2, 0.05]) / 0.9872)).float()
-    place = torch.tensor([0.2, -0.1, 0.3])
-    view = View.pinhole(turn, place, width=WIDTH, height=HEIGHT, fx=30.0, fy=28.0)
-    world = (
-        torch.from_numpy(means).float() - place
-    ) @ turn  # means are given in the camera's frame
-    return RasterInputs(
-        view=view,
-        splats=Splats(
-            means=world,
-            opacities=torch.from_numpy(opacities).float(),
-            scales=torch.from_numpy(scales).float(),
-            rotations=torch.from_numpy(rotations).float(),
-            colors=torch.from_numpy(colours).float(),
-        ),
-        counts=True,
-        scores=True,
-    )
+        pixels = torch.tensor([[18.0, 10.0], [9.0, 14.0], [28.0, 5.0], [20.0, 16.0]])
+        splats.means[:4] = scenes.unproject(inputs.view, pixels, torch.linspace(0.4, 0.6, 4))
+        splats.scales[:4] = torch.tensor([1.5, 0.05, 0.05])
+        tilt = torch.tensor([[0.0, 0.6, 0.1], [0.4, 0.0, 0.3], [0.0, -0.3, 0.4], [-0.5, 0.2, 0.0]])
+        ahead = torch.nn.functional.normalize(inputs.view.viewmatrix[:3, 2] + tilt, dim=1)
+        side = torch.tensor([1.0, 0, 0]).expand(4, 3)  # the long axis, turned ahead
+        halfway = torch.cat([1 + ahead[:, :1], torch.linalg.cross(side, ahead)], dim=1)
+        splats.rotations[:4] = torch.nn.functional.normalize(halfway, dim=1)
+    return replace(inputs, counts=True, scores=True)
 
 
 def expected(inputs, thresholds):
@@ -102,12 +81,9 @@ def expected(inputs, thresholds):
 @pytest.mark.parametrize("near", [False, True])
 @pytest.mark.parametrize("threshold", [1e-6, 0.2])
 def test_points_lie_where_the_heaviest_gaussian_is_met(near, threshold):
-    generator = np.random.default_rng(5)
     seen = 0
     for seed in range(3):
-        parts = scene(seed, near)
-        inputs = inputs_of(*parts, generator.uniform(size=(len(parts[0]), 3)))
-        thresholds = torch.full((len(parts[0]),), threshold)
+        inputs, thresholds = scene(seed, near), torch.full((14,), threshold)
         want, behind = expected(inputs, thresholds)
         seen += int(behind.sum())
         for name in ("reference", "cpu"):
@@ -134,8 +110,8 @@ def expect_same(have, want):
 
 
 def test_where_nothing_is_drawn_there_is_no_point_and_all_of_the_transmittance():
-    means, scales, rotations, opacities = scene(0, near=False)
-    inputs = inputs_of(means - (0, 0, 9), scales, rotations, opacities, means)
+    inputs = scene(0, near=False)
+    inputs.splats.opacities.zero_()
     rasterize = create_engine("reference").rasterize
     have = render_depth(inputs, lambda each: rasterize(each, None))
     assert (have["accum_alpha"] == 1).all()

@@ -1,6 +1,5 @@
 """Mip-Splatting: two filters, absolute gradients, on a miniature of the host."""
 
-import shutil
 import sys
 
 import pytest
@@ -10,7 +9,6 @@ from miniatures.runs import (
     OPTIONS,
     check_measured,
     command,
-    frozen_differences,
     miniature,
 )
 from miniatures.vanilla_3dgs import joint, label, running
@@ -18,7 +16,7 @@ from miniatures.vanilla_3dgs import joint, label, running
 from fragprune_mip_splatting import MipSplatting
 from fragprune_plugins.adapting import HostRepo, NotComparedError
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.injection.launch import run
 from fragprune_plugins.testing.invariants.case import FixedThresholds
 
 COUNT = 16
@@ -109,18 +107,6 @@ def test_the_size_of_the_2d_filter_is_read_from_the_command_or_the_source(mini, 
     assert drawing == {"dilation": kernel, "compensation": "mip"}
     with pytest.raises(NotComparedError, match="--load_allres"):
         MipSplatting().drawing(HostRepo(mini), ["--eval", "--load_allres"])
-
-
-def test_a_point_cloud_alone_is_resumed(mini, photographs, trained, tmp_path):
-    summary, _, _ = trained
-    shutil.copytree(summary.model_after.parent, tmp_path / "point_cloud" / "iteration_28")
-    start = tmp_path / "point_cloud" / "iteration_28" / "point_cloud.ply"
-    words = command(mini / "train.py", photographs, tmp_path, 20, "--start_checkpoint", start)
-    again = run(words, RunOptions(device="cpu", stage="finetune", settings=OPTIONS.settings))
-    paths = (again.model_before, again.model_after)
-    assert frozen_differences(*paths, MipSplatting().read_model) == []
-    first, second = (sidecar.load(s.model_after)[0] for s in (summary, again))
-    assert (first.steps, second.steps) == (8, 16)
 
 
 def test_the_hosts_fusing_script_carries_thresholds_along(mini, trained, tmp_path):

@@ -1,21 +1,22 @@
 """RAIN-GS: far splits, wide dilation, an own clock, on a miniature of the host."""
 
 import sys
-from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
 import pytest
 import torch
 from miniatures import runs
+from miniatures.hosts import HOSTS
 from miniatures.rain_gs import RainHost
-from miniatures.runs import OPTIONS, check_stage_two, miniature
+from miniatures.runs import OPTIONS, check_stage_two, miniature, written
 from miniatures.vanilla_3dgs import joint
 from scenes import blended
 
 from fragprune_plugins.adapting import HostRepo, read_ply
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.testing.conformance import found_adapter
 from fragprune_plugins.testing.invariants.case import FixedThresholds
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.run.work import measure_models, photographs_of
@@ -30,24 +31,34 @@ mini, of = miniature(RainHost, RainGS, driver=RainHost)
 # -- which host, and its rasterizer ----------------------------------------------------------------
 
 
-def test_dilation_reaches_the_engine_and_blended_depth_comes_back_without_a_gradient(mini):
+def test_dilation_reaches_the_engine(mini):
     notes = FixedThresholds()
-    with joint(**of(mini, plugins=[notes])) as host:
+    with joint(**of(mini, plugins=[notes])) as host, torch.no_grad():
         model, camera = host.model(COUNT), host.camera(20, 14)
-        host.store(model).open(host.adapter.opacities(model))
         render, pipe = import_module("gaussian_renderer").render, host.driver.pipe()
         wide = render(camera, model, pipe, torch.zeros(3), low_pass=40.0)
         assert notes.inputs.dilation == 40.0
         usual = render(camera, model, pipe, torch.zeros(3))
         assert notes.inputs.dilation == pytest.approx(0.3)
+    assert (wide["radii"] > usual["radii"]).any()
+
+
+@pytest.mark.parametrize("name", ["rain-gs", "4dgaussians"])
+def test_depth_is_the_sum_of_blended_depths_and_has_no_gradient(name, tmp_path):
+    notes, driver = FixedThresholds(), HOSTS[name]
+    told = {"path": written(driver, tmp_path), "adapter": found_adapter(name), "driver": driver()}
+    with joint(**told, plugins=[notes], engine="reference") as host:
+        model, camera = host.model(COUNT), host.camera(20, 14)
+        host.store(model).open(host.adapter.opacities(model))
+        package = host.render(camera, model)
         view, splats = notes.inputs.view, notes.inputs.splats
         depths = splats.means @ view.viewmatrix[:3, 2] + view.viewmatrix[3, 2]
-    assert (wide["radii"] > usual["radii"]).any()
-    depth = usual["depth"]
-    torch.testing.assert_close(depth, blended(view, splats, depths), rtol=1e-4, atol=1e-4)
-    assert depth.any()
-    assert not depth.requires_grad
-    assert usual["render"].requires_grad
+        assert torch.equal(splats.means, model.get_xyz) == (name == "rain-gs")  # or moved
+        expected = blended(view, splats, depths.detach())
+    torch.testing.assert_close(package["depth"], expected, rtol=1e-4, atol=1e-4)
+    assert package["depth"].any()
+    assert not package["depth"].requires_grad
+    assert package["render"].requires_grad
 
 
 # -- whole runs ----------------------------------------------------------------------------------
@@ -89,16 +100,6 @@ def test_iterations_are_counted_where_the_host_sets_no_rate(mini, scene, tmp_pat
     assert [c["step"] for c in summary.curves] == list(range(16, 24))
     store, _ = sidecar.load(summary.model_after)
     assert len(store) == len(read_ply(summary.model_after).xyz)
-
-
-def test_an_experiments_name_is_enough_to_find_its_folder(mini, scene, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    words = [w for w in command(mini, scene, "OUT", 12) if w not in ("-m", "OUT")]
-    words += ["--exp_name", "fox"]
-    run(words, replace(OPTIONS, stage="off"))
-    assert Path("output/fox/point_cloud/iteration_12").is_dir()
-    summary = run(words, replace(OPTIONS, stage="finetune"))
-    assert summary.model_after.resolve().is_relative_to(tmp_path / "output" / "fox")
 
 
 def test_what_resumes_is_left_without_the_modes():

@@ -297,8 +297,8 @@ def test_the_last_section_of_the_file_wins(tmp_path):
     assert yaml.read(file) == {"batch_size": 2, "rate": 1e-5, "eval": True} | values
 
 
-@pytest.mark.parametrize("text", [None, "- 1\n- 2\n", "a: [1\n", "a: ${b}\n"])
-def test_a_file_that_cannot_be_read_is_refused(mini, tmp_path, text):
+@pytest.mark.parametrize("text", [None, "- 1\n- 2\n", "a: [1\n", "a: ${b}\n", "{gaussian_dim: 4}"])
+def test_a_file_that_cannot_be_read_or_added_to_is_refused(mini, tmp_path, text):
     file = tmp_path / "a.yaml"
     if text is not None:
         file.write_text(text)
@@ -310,13 +310,6 @@ def test_without_omegaconf_the_error_says_who_needs_it(mini, config, monkeypatch
     monkeypatch.setitem(sys.modules, "omegaconf", None)
     with pytest.raises(HostNeedsError, match=r"omegaconf.*host reads.*pip install omegaconf"):
         run(command(mini, config()), RunOptions(**OPTIONS))
-
-
-def test_a_layout_that_nothing_can_be_added_to_is_refused(mini, tmp_path, photographs):
-    file = tmp_path / "a.yaml"
-    file.write_text(f"{{gaussian_dim: 4, source_path: '{photographs}', iterations: 4}}")
-    with pytest.raises(UsageError, match="--config"):
-        run(command(mini, file), RunOptions(**OPTIONS))
 
 
 def test_neighbours_are_the_nearest_of_their_batch():
