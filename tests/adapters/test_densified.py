@@ -11,6 +11,7 @@ from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.testing.conformance import found_adapter
 
 UNTIL = ("--densify_until_iter", "700")
+SIMPLIFIED = ("--simp_iteration1", "700", "--simp_iteration2", "720")
 
 
 @pytest.mark.parametrize(
@@ -32,30 +33,16 @@ UNTIL = ("--densify_until_iter", "700")
         ("speedy-splat", [*UNTIL], 30_000),
         ("speedy-splat", [*UNTIL, "--prune_until_iter", "0"], 700),
         ("lp-3dgs", [*UNTIL], 700),
+        ("light-gaussian/prune_finetune.py", [*UNTIL], None),  # it goes on from a checkpoint
+        ("mini-splatting/gs/train.py", [*UNTIL, *SIMPLIFIED], 700),
+        ("mini-splatting/ms/train.py", [*UNTIL, *SIMPLIFIED], 720),
         ("compact-3dgs", [*UNTIL], None),
     ],
 )
 def test_the_end_of_densification_is_read_from_the_hosts_own_arguments(name, words, end, tmp_path):
+    name, _, script = name.partition("/")
     adapter, root = found_adapter(name), written(HOSTS[name], tmp_path)
-    assert adapter.densified(HostRepo(root), root / adapter.scripts[0], words) == end
-
-
-def test_mini_splatting_ends_with_its_last_simplification(tmp_path):
-    repo = HostRepo(written(HOSTS["mini-splatting"], tmp_path))
-    words = [*UNTIL, "--simp_iteration1", "700", "--simp_iteration2", "720"]
-    ends = {
-        variant: found_adapter("mini-splatting").densified(
-            repo, repo.root / variant / "train.py", words
-        )
-        for variant in ("gs", "ms")
-    }
-    assert ends == {"gs": 700, "ms": 720}
-
-
-def test_what_follows_a_checkpoint_has_no_densification_to_wait_for(tmp_path):
-    root = written(HOSTS["light-gaussian"], tmp_path)
-    script = root / "prune_finetune.py"
-    assert found_adapter("light-gaussian").densified(HostRepo(root), script, [*UNTIL]) is None
+    assert adapter.densified(HostRepo(root), root / (script or adapter.scripts[0]), words) == end
 
 
 def test_a_configuration_file_overrides_the_flag_as_it_does_in_the_host(tmp_path):

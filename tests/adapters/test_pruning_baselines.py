@@ -1,6 +1,7 @@
 """Speedy-Splat, LP-3DGS and Compact-3DGS: what runs, and what is refused by name."""
 
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -86,19 +87,10 @@ def test_lp_prunes_by_the_weights_of_what_is_drawn(lp, photographs, tmp_path):
 
 def test_lps_weights_add_up_to_the_picture_of_white_gaussians(lp):
     with joint(path=lp, adapter=LP3DGS()) as host, torch.no_grad():
-        model, camera = host.model(20), host.camera()
-        from gaussian_renderer import render
-
-        black = torch.zeros(3)
-        package = render(
-            camera,
-            model,
-            host.driver.pipe(),
-            black,
-            override_color=torch.ones(20, 3),
-            bw_score=True,
-        )
-        plain = render(camera, model, host.driver.pipe(), black)
+        render = import_module("gaussian_renderer").render
+        given = host.camera(), host.model(20), host.driver.pipe(), torch.zeros(3)
+        package = render(*given, override_color=torch.ones(20, 3), bw_score=True)
+        plain = render(*given)
     torch.testing.assert_close(package["important_score"].sum(), package["render"][0].sum())
     assert package["gaussians_count"] is None
     assert plain["important_score"] is None

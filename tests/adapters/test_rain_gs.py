@@ -35,6 +35,7 @@ def test_dilation_reaches_the_engine(mini):
     notes = FixedThresholds()
     with joint(**of(mini, plugins=[notes])) as host, torch.no_grad():
         model, camera = host.model(COUNT), host.camera(20, 14)
+        host.store(model).open(host.adapter.opacities(model))
         render, pipe = import_module("gaussian_renderer").render, host.driver.pipe()
         wide = render(camera, model, pipe, torch.zeros(3), low_pass=40.0)
         assert notes.inputs.dilation == 40.0

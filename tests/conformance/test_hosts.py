@@ -55,7 +55,7 @@ def relative(
 
 
 SAME_SOURCE = {"test_refuse": None}  # it reads nothing else
-FEW = {"examples": 5, "longest_order": 1} | SAME_SOURCE
+FEW = {"examples": 5, "test_off_is_off": None} | SAME_SOURCE
 TestGaussianSplattingMCMC = relative("gaussian-splatting", MCMCHost, **SAME_SOURCE)
 TestSurfels = relative("2dgs")
 Test4DGaussians = relative("4dgaussians")

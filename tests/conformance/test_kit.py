@@ -64,22 +64,6 @@ def test_a_host_that_forgets_to_be_followed_is_found():
         fresh(invariants.alignment, invariants.Case(Vanilla3DGS(), Forgetful(), HOST, examples=3))
 
 
-def test_a_host_without_bands_is_not_asked_to_draw_one():
-    fresh(invariants.freeze, invariants.Case(Vanilla3DGS(), Bandless(), HOST))
-
-
-class Bandless(Host):
-    """Colours from a constant alone, as of hosts whose colours come from a network."""
-
-    colour = frozenset({"f_dc"})
-
-    def new_model(self, degree):
-        return super().new_model(0)
-
-    def parameters(self, model):
-        return {name: p for name, p in super().parameters(model).items() if name != "f_rest"}
-
-
 class Forgetful(Host):
     def actions(self):
         return {"behind the back": behind_the_back}

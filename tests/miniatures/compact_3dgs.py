@@ -18,6 +18,7 @@ from miniatures.family import (
     STEP,
     TRAIN,
     Descendant,
+    Growth,
     adding,
 )
 
@@ -148,32 +149,6 @@ class Added:
             held = isinstance(tensor, nn.Parameter)  # noqa: F821
             parameter = tensor if held else nn.Parameter(tensor.requires_grad_(True))  # noqa: F821
             setattr(self, f"_{name}", parameter)
-
-    def densification_postfix(self, new_xyz, new_opacities, new_scaling, new_rotation, new_mask):
-        new = (new_xyz, new_opacities, new_scaling, new_rotation, new_mask)
-        names = ("xyz", "opacity", "scaling", "rotation", "mask")
-        tensors = dict(zip(names, new, strict=True))
-        self._adopt(self.cat_tensors_to_optimizer(tensors))
-        self._reset_statistics()
-        self.max_radii2D = torch.zeros(self.get_xyz.shape[0], device="cuda")
-
-    def densify_and_clone(self, grads, grad_threshold, scene_extent):
-        chosen = self._needy(grads, grad_threshold, scene_extent, large=False)
-        own = (self._xyz, self._opacity, self._scaling, self._rotation, self._mask)
-        self.densification_postfix(*(tensor[chosen] for tensor in own))
-
-    def densify_and_split(self, grads, grad_threshold, scene_extent, N=2):
-        chosen = self._needy(grads, grad_threshold, scene_extent, large=True)
-        spread = self.get_scaling[chosen].repeat(N, 1)
-        self.densification_postfix(
-            self._xyz[chosen].repeat(N, 1) + spread * torch.randn_like(spread),
-            self._opacity[chosen].repeat(N, 1),
-            self.scaling_inverse_activation(spread / (0.8 * N)),
-            self._rotation[chosen].repeat(N, 1),
-            self._mask[chosen].repeat(N, 1),
-        )
-        children = torch.zeros(len(spread), dtype=torch.bool, device="cuda")
-        self.prune_points(torch.cat((chosen, children)))
 
     def mask_prune(self):
         self.prune_points((torch.sigmoid(self._mask) <= 0.01).squeeze(-1))
@@ -342,7 +317,7 @@ class CompactHost(Descendant):
         ],
     }
     functions = (after_densification,)
-    added = Added
+    added = (Growth, Added)
     files = {"scene/network.py": NETWORK}
 
     def new_model(self, degree: int) -> Any:

@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
+import torch
+
 from fragprune_plugins.testing.host import Host
 from fragprune_plugins.testing.rewriting import Changes, changed, rewrite, without
 
@@ -42,6 +44,34 @@ class Timed:
         return copy.deepcopy(self)
 
 
+class Growth:
+    """Density control of models with other tensors than vanilla: rows of all in the optimizer."""
+
+    def _children(self, chosen, copies):
+        rows = chosen.nonzero()[:, 0].repeat(copies)
+        groups = [group for group in self.optimizer.param_groups if len(group["params"]) == 1]
+        return {group["name"]: group["params"][0][rows] for group in groups}
+
+    def _append(self, new):
+        self._adopt(self.cat_tensors_to_optimizer(new))
+        self._reset_statistics()
+        self.max_radii2D = torch.zeros(len(self.get_xyz))
+
+    def densify_and_clone(self, grads, grad_threshold, scene_extent, *_):
+        chosen = self._needy(grads, grad_threshold, scene_extent, large=False)
+        self._append(self._children(chosen, 1))
+
+    def densify_and_split(self, grads, grad_threshold, scene_extent, N=2):
+        chosen = self._needy(grads, grad_threshold, scene_extent, large=True)
+        new = self._children(chosen, N)
+        spread = new["scaling"].exp()
+        new["xyz"] = new["xyz"] + torch.normal(torch.zeros_like(spread), spread)
+        new["scaling"] = new["scaling"] - 0.47
+        self._append(new)
+        children = torch.zeros(len(spread), dtype=torch.bool)
+        self.prune_points(torch.cat((chosen, children)))
+
+
 class Descendant(Host):
     """A host written from its differences.
 
@@ -53,7 +83,7 @@ class Descendant(Host):
         cuts: the text of a file from one passage up to another (or its end), and what replaces it.
         changes: passages of files, and what replaces them.
         functions: put into ``train.py``, where changes call them.
-        added: methods of GaussianModel, as ``rewrite`` takes them.
+        added: methods of GaussianModel, as ``rewrite`` takes them, one class after another.
         files: whole files by their paths.
         gone: names of functions and methods that the host does not have, by file.
     """
@@ -65,7 +95,7 @@ class Descendant(Host):
     cuts: ClassVar[Mapping[str, tuple[str, str, str]]] = {}
     changes: ClassVar[Mapping[str, Changes]] = {}
     functions: ClassVar[Sequence[Callable[..., Any]]] = ()
-    added: ClassVar[type | None] = None
+    added: ClassVar[Sequence[type]] = ()
     files: ClassVar[Mapping[str, str]] = {}
     gone: ClassVar[Mapping[str, Sequence[str]]] = {}
 
@@ -79,7 +109,9 @@ class Descendant(Host):
             begin, end = text.index(first), text.index(next_) if next_ else len(text)
             (root / name).write_text(text[:begin] + new + text[end:])
         rewrite(root, self._usual())
-        rewrite(root, self.changes, self.added)
+        rewrite(root, self.changes)
+        for each in self.added:
+            rewrite(root, {}, each)
         insert(root / TRAIN, *self.functions)
         for name, text in self.files.items():
             file = root / name

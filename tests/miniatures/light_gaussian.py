@@ -21,7 +21,7 @@ from miniatures.family import (
     adding,
     parsing,
 )
-from miniatures.speedy_splat import prune_by_score
+from miniatures.speedy_splat import Pruning, prune_by_score
 
 args = SimpleNamespace()  # the host's scripts hold their options under this name
 
@@ -50,10 +50,6 @@ class Added:
 
     def prune_opacity(self, percent):
         self.prune_gaussians(percent, self.get_opacity)
-
-    def prune_gaussians(self, percent, import_score):
-        lowest = import_score.sort(dim=0).values[int(percent * (len(import_score) - 1))]
-        self.prune_points((import_score <= lowest).squeeze())
 
 
 def prune_list(gaussians, scene, pipe, background):
@@ -201,7 +197,7 @@ class LightGaussianHost(Descendant):
         ],
     }
     functions = (prune_list, prune, last_checkpoint, begin, distil)
-    added = Added
+    added = (Pruning, Added)
 
     def write(self, root: Path) -> None:
         super().write(root)

@@ -82,7 +82,7 @@ class LPHost(Descendant):
             ),
         ],
     }
-    added = Pruning
+    added = (Pruning,)
     files = {
         "scene/gaussian_model_mini_splatting.py": POOLED.format(
             name="MiniSplatting", score="bw_score"

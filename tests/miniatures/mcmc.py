@@ -171,7 +171,7 @@ class MCMCHost(Descendant):
         ],
     }
     functions = (regularisers, move_in, wander)
-    added = Added
+    added = (Added,)
     files = {"utils/reloc_utils.py": RELOCATION_MODULE}
 
     def step(self, model, camera, iteration, background):

@@ -173,7 +173,7 @@ class MiniSplattingHost(Descendant):
 
     routine = ("densify by mask", "new points", "simplify", "reset opacity", "another band")
     changes = {TRAIN: [PATH]}
-    added = Added
+    added = (Added,)
     files = {"lpipsPyTorch/__init__.py": LPIPS}
 
     def write(self, root: Path) -> None:

@@ -173,7 +173,7 @@ class MipHost(Descendant):
             ('folder / "gt"', 'folder / "gt_1"'),
         ],
     }
-    added = Added
+    added = (Added,)
     files = {"create_fused_ply.py": FUSE}
 
     def refresh(self, model: Any) -> None:

@@ -12,14 +12,13 @@ import torch
 from fragprune_plugins.testing.host import FAINT
 from fragprune_plugins.testing.rewriting import changed
 from miniatures.family import (
-    ANEW,
     MODEL,
-    NEW_ROWS,
     RADII,
     RENDERER,
     SCENE,
     TRAIN,
     Descendant,
+    Growth,
     Timed,
     adding,
 )
@@ -87,24 +86,10 @@ class Added:
         for name in ("_deformation_table", "_deformation_accum"):
             setattr(self, name, getattr(self, name)[~mask])
 
-    def _rows(self, chosen, copies=1):
-        names = ("_xyz", "_features_dc", "_features_rest", "_opacity", "_scaling", "_rotation")
-        for tensor in (*(getattr(self, name) for name in names), self._deformation_table):
-            yield tensor[chosen].repeat(copies, *[1] * (tensor.ndim - 1))
-
-    def densify_and_clone(self, grads, grad_threshold, scene_extent, *_):
-        chosen = self._needy(grads, grad_threshold, scene_extent, large=False)
-        self.densification_postfix(*self._rows(chosen))
-
-    def densify_and_split(self, grads, grad_threshold, scene_extent, N=2):
-        chosen = self._needy(grads, grad_threshold, scene_extent, large=True)
-        if not chosen.any():
-            return
-        xyz, dc, rest, opacity, scaling, *others = self._rows(chosen, N)
-        xyz = xyz + torch.normal(torch.zeros_like(xyz), scaling.exp())
-        self.densification_postfix(xyz, dc, rest, opacity, scaling - 0.47, *others)
-        children = torch.zeros(len(xyz), dtype=torch.bool)
-        self.prune_points(torch.cat((chosen, children)))
+    def _children(self, chosen, copies):
+        table = self._deformation_table
+        self._deformation_table = torch.cat([table, table[chosen].repeat(copies)])
+        return self.vanilla_children(chosen, copies)
 
     def densify(self, max_grad, min_opacity, extent, max_screen_size, *_):
         grads = (self.xyz_gradient_accum / self.denom).nan_to_num(0.0)
@@ -279,7 +264,6 @@ MERGE = """    args.save_iterations.append(args.iterations)
 LOADED = "            gaussians.load_ply(self._ply(self.loaded_iter))\n"
 VIEWS = '    for index, view in enumerate(tqdm(views, desc=f"Rendering {name}")):\n'
 OF_GROUPS = "            for group in self.optimizer.param_groups\n"
-TABLE = "self._deformation_table"
 IDLE = ("timenet", "opacity_deform", "shs_deform")
 """Parts of the network that its defaults leave unused."""
 
@@ -318,8 +302,6 @@ class MovingHost(Descendant):
                 '            new = tensors_dict[group["name"]]\n',
                 before='            if len(group["params"]) > 1:\n                continue\n',
             ),
-            (NEW_ROWS, NEW_ROWS.replace("    ):", "        new_deformation_table,\n    ):")),
-            adding(ANEW, after=f"        {TABLE} = torch.cat([{TABLE}, new_deformation_table])\n"),
         ],
         SCENE: [
             adding(
@@ -344,7 +326,7 @@ class MovingHost(Descendant):
         ],
     }
     functions = (Timed, scene_reconstruction, training)
-    added = Added
+    added = (Growth, Added)
     files = {"scene/deformation.py": NETWORK}
     gone = {
         MODEL: ("densify_and_prune",),

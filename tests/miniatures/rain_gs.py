@@ -158,7 +158,7 @@ class RainHost(Descendant):
         ],
     }
     functions = (dilation, rate)
-    added = Added
+    added = (Added,)
     files = {
         f"{PACKAGE}/diff_gaussian_rasterization/__init__.py": BINDING,
         f"{PACKAGE}/setup.py": 'raise ImportError("no compiler here")\n',

@@ -6,7 +6,17 @@ from types import SimpleNamespace
 import torch
 
 from fragprune_plugins.testing.host import Chance
-from miniatures.family import MODEL, PARSE, RENDERER, SCENE, TRAIN, Descendant, Timed, adding
+from miniatures.family import (
+    MODEL,
+    PARSE,
+    RENDERER,
+    SCENE,
+    TRAIN,
+    Descendant,
+    Growth,
+    Timed,
+    adding,
+)
 
 ATTRIBUTES = {
     "xyz": "_xyz",
@@ -161,42 +171,13 @@ class Added:
         elif self.active_sh_degree_t < self.max_sh_degree_t:
             self.active_sh_degree_t += 1
 
-    def densification_postfix(
-        self,
-        new_xyz,
-        new_features_dc,
-        new_features_rest,
-        new_opacities,
-        new_scaling,
-        new_rotation,
-        new_t,
-        new_scaling_t,
-        new_rotation_r,
-    ):
-        new = [new_xyz, new_features_dc, new_features_rest, new_opacities, new_scaling]
-        new += [new_rotation, new_t, new_scaling_t, new_rotation_r]
-        self._adopt(self.cat_tensors_to_optimizer(dict(zip(self._names(), new, strict=False))))
-        self._reset_statistics()
-        self.max_radii2D = torch.zeros(self.get_xyz.shape[0])
-
-    def _rows(self, chosen, copies=1):
-        for name in ATTRIBUTES.values():
-            tensor = getattr(self, name)
-            yield (tensor[chosen].repeat(copies, *[1] * (tensor.ndim - 1)) if len(tensor) else None)
-
     def densify_and_clone(self, grads, grad_threshold, scene_extent, grads_t, grad_t_threshold):
-        chosen = self._needy(grads, grad_threshold, scene_extent, large=False)
-        self.densification_postfix(*self._rows(chosen))
+        self.vanilla_densify_and_clone(grads, grad_threshold, scene_extent)
 
     def densify_and_split(
         self, grads, grad_threshold, scene_extent, grads_t, grad_t_threshold, N=2
     ):
-        chosen = self._needy(grads, grad_threshold, scene_extent, large=True)
-        xyz, dc, rest, opacity, scaling, *others = self._rows(chosen, N)
-        xyz = xyz + torch.normal(torch.zeros_like(xyz), scaling.exp())
-        self.densification_postfix(xyz, dc, rest, opacity, scaling - 0.47, *others)
-        children = torch.zeros(len(xyz), dtype=torch.bool)
-        self.prune_points(torch.cat((chosen, children)))
+        self.vanilla_densify_and_split(grads, grad_threshold, scene_extent, N)
 
     def densify_and_prune(
         self, max_grad, min_opacity, extent, max_screen_size, max_grad_t=None, prune_only=False
@@ -403,7 +384,7 @@ class RT4DGSHost(Descendant):
         ],
     }
     functions = (Timed, training)
-    added = Added
+    added = (Growth, Added)
     files = {"gaussian_renderer/diff_gaussian_rasterization.py": RASTERIZER}
     gone = {
         MODEL: ("save_ply", "load_ply", "construct_list_of_attributes"),

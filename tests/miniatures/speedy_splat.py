@@ -12,7 +12,7 @@ args = SimpleNamespace()  # the hosts' scripts hold their options under this nam
 
 
 class Pruning:
-    """What the models of both pruning methods have besides."""
+    """What the models of pruning methods have besides."""
 
     def prune_gaussians(self, percent, import_score):
         lowest = import_score.sort(dim=0).values[int(percent * (len(import_score) - 1))]
@@ -67,7 +67,7 @@ class SpeedyHost(Descendant):
         ],
     }
     functions = (prune,)
-    added = Pruning
+    added = (Pruning,)
     files = {"lpipsPyTorch/__init__.py": LPIPS}
 
     def actions(self):
