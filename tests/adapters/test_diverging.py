@@ -1,17 +1,11 @@
 """NaN and infinity end stage 2 with a stated error, and nothing of them is saved."""
 
-from pathlib import Path
-
 import pytest
 import torch
-from cli.commands import run_error
-from miniatures.runs import TINY
-from miniatures.vanilla_3dgs import HOST, joint, running
+from miniatures.vanilla_3dgs import joint, running
 
 from fragprune_plugins.errors import DivergedError
-from fragprune_plugins.files import sidecar
 from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.plugins.hookspecs import hookimpl
 
 
 def spoil(tensor, rows, value):
@@ -87,30 +81,3 @@ def test_what_shows_in_no_loss_is_noticed_within_ten_steps(what, value, noticed)
         with pytest.raises(DivergedError, match=what) as caught:
             host.step(model, camera, noticed)
     assert caught.value.where == f"stage 2, after step {noticed}"
-
-
-class SpoilAt:
-    """NaN in a host's model in the middle of a run."""
-
-    def __init__(self, step):
-        self.step, self.model = step, None
-
-    @hookimpl
-    def fragprune_attached(self, model):
-        self.model = model
-
-    @hookimpl
-    def fragprune_step(self, stats):
-        if stats.step == self.step:
-            spoil(self.model._opacity, 7, torch.nan)
-
-
-def test_a_run_that_diverges_ends_with_exit_code_1_and_saves_nothing(photographs, tmp_path, plug):
-    plug(SpoilAt(4))
-    out = tmp_path / "out"
-    words = [HOST / "train.py", "-s", photographs, "-m", out, "--iterations", 10, *TINY]
-    error = run_error("run", "--device", "cpu", "--iters", 8, "--json", "--", *words)
-    assert error["code"] == "not-finite"
-    assert "opacity (7 of " in error["found"]
-    assert [p.name for p in sorted(Path(out).glob("point_cloud/*"))] == ["iteration_10"]
-    assert not list(out.rglob(f"*{sidecar.SUFFIX}"))

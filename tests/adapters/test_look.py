@@ -23,18 +23,23 @@ from fragprune_plugins.workbench.models.model import load
 ENDED = ("--densify_until_iter", 8)
 """Before the last iteration, as in every training that ends."""
 
-RESUMED = {
-    "2dgs": ("train.py",),
-    "3dgs-fork": ("train_scene.py",),
-    "light-gaussian": ("train_densify_prune.py", "--prune_iterations", 9),
-    "lp-3dgs": ("train.py",),
-    "mcmc": ("train.py", "--cap_max", 170),
-    "mini-splatting": ("ms/train.py", "--imp_metric", "indoor", "--simp_iteration1", 8),
-    "mip-splatting": ("train.py",),
-    "rain-gs": ("train.py",),
-    "speedy-splat": ("train.py", "--prune_until_iter", 0),
-    "vanilla-3dgs": ("train.py",),
-}
+POINTS = ("--depth_interval", 6, "--num_depth", 240, "--simp_iteration2", 9)
+"""Mini-Splatting's new points from depth, and its second simplification."""
+
+RESUMED = (
+    ("2dgs", "train.py"),
+    ("3dgs-fork", "train_scene.py"),
+    ("light-gaussian", "train_densify_prune.py", "--prune_iterations", 9),
+    ("lp-3dgs", "train.py"),
+    ("mcmc", "train.py", "--cap_max", 170),
+    ("mini-splatting", "gs/train.py"),
+    ("mini-splatting", "ms/train.py", "--imp_metric", "indoor", "--simp_iteration1", 8, *POINTS),
+    ("mini-splatting", "ms_d/train.py", *POINTS),
+    ("mip-splatting", "train.py"),
+    ("rain-gs", "train.py"),
+    ("speedy-splat", "train.py", "--prune_until_iter", 0),
+    ("vanilla-3dgs", "train.py"),
+)
 """Hosts whose models are looked at, with the script and what its command needs besides."""
 
 FROM_PLY = ("2dgs", "light-gaussian", "mip-splatting", "vanilla-3dgs")
@@ -72,23 +77,31 @@ def trained(stage_one, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("host", "alone"), [*((host, False) for host in RESUMED), *((host, True) for host in FROM_PLY)]
+    ("alone", "host", "script", "more"),
+    [
+        (alone, host, script, more)
+        for host, script, *more in RESUMED
+        for alone in ((False, True) if host in FROM_PLY else (False,))
+    ],
 )
-def test_stage_two_begins_with_the_gaussians_that_are_kept(host, alone, photographs, tmp_path):
+def test_stage_two_begins_with_the_gaussians_that_are_kept(
+    alone, host, script, more, photographs, tmp_path
+):
     folder, look = runs.written(HOSTS[host], tmp_path / "host"), Looked()
-    script, *more = RESUMED[host]
     words = runs.command(folder / script, photographs, tmp_path / "out", 10, *ENDED, *more)
     if alone:
         run(words, replace(OPTIONS, stage="off"))
     written = {path: path.read_bytes() for path in tmp_path.rglob("out/**/*.p*")}
     summary = run(words, replace(OPTIONS, look=look, stage="finetune" if alone else "auto"))
-    assert [seen[0] for seen in look.seen] == [summary.model_before]
+    ((shown, _, drawing, _),) = look.seen
+    assert (shown, drawing) == (summary.model_before, summary.drawing)
     before, after = (
         load(ply, filtered=True) for ply in (summary.model_before, summary.model_after)
     )
     for name in FROZEN:
         assert torch.equal(getattr(after, name), getattr(before, name)[::2]), name
     store, info = sidecar.load(summary.model_after)
+    assert info.adapter == host
     assert len(store) == summary.gaussians == len(after.xyz)
     assert info.settings["dropout"] == summary.settings["dropout"] == 0.25
     assert {path: path.read_bytes() for path in written} == written
@@ -104,13 +117,6 @@ def test_a_stage_two_that_a_look_changed_is_finished_when_asked_again(trained):
     assert again.look.seen == []
     other = replace(options, settings=replace(options.settings, dropout=0.5))
     assert not run(trained, other).already_finished
-
-
-def test_a_look_is_told_by_which_rules_the_host_draws(photographs, tmp_path):
-    script, look = runs.written(HOSTS["mip-splatting"], tmp_path / "host") / "train.py", Looked()
-    words = runs.command(script, photographs, tmp_path / "out", 10, *ENDED, "--kernel_size", 0.2)
-    run(words, replace(OPTIONS, look=look))
-    assert [drawing for _, _, drawing, _ in look.seen] == [{"dilation": 0.2, "compensation": "mip"}]
 
 
 def test_a_checkpoint_with_other_gaussians_than_the_ply_is_resumed_whole(

@@ -8,12 +8,13 @@ from importlib import import_module
 import numpy as np
 import pytest
 import torch
+from miniatures import runs
 from miniatures.mini_splatting import MiniSplattingHost
-from miniatures.runs import check_stage_two, miniature
+from miniatures.runs import miniature
 from miniatures.vanilla_3dgs import HOST, InterruptAt, joint, label, running
 
 from fragprune_mini_splatting import MiniSplatting
-from fragprune_plugins.adapting import HostRepo, read_ply
+from fragprune_plugins.adapting import HostRepo
 from fragprune_plugins.errors import AlignmentError, Interrupted, SeamError, UnknownHostError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.hosts.choosing import choose, locate
@@ -71,46 +72,23 @@ def test_scores_are_those_of_the_truncated_picture(mini, engine):
 
 # -- runs ----------------------------------------------------------------------------------------
 
-TINY = [
-    *("-r", "1", "--sh_degree", "1", "--eval", "--test_iterations", "-1"),
-    *("--densify_from_iter", "2", "--densification_interval", "4"),
-    *("--densify_grad_threshold", "0.0008"),
+FLAGS = [
+    *("--densify_until_iter", 10, "--simp_iteration1", 10, "--simp_iteration2", 13),
+    *("--depth_interval", 6, "--num_depth", 240, "--imp_metric", "indoor"),
 ]
-OWN = ["--depth_interval", 6, "--num_depth", 240, "--simp_iteration2", 13]
-FLAGS = {
-    "gs": ["--densify_until_iter", 10],
-    "ms": ["--densify_until_iter", 10, "--simp_iteration1", 10, *OWN, "--imp_metric", "indoor"],
-    "ms_d": ["--densify_until_iter", 10, *OWN],
-}
 OPTIONS = RunOptions(
     device="cpu", settings=Settings(iterations=6, threshold_lr=0.3, train="opacity")
 )
 
 
-def command(mini, variant, scene, out, iterations, *more):
-    words = [mini / variant / "train.py", "-s", scene, "-m", out, "--iterations", iterations]
-    return [str(word) for word in (*words, *TINY, *FLAGS[variant], *more)]
-
-
-@pytest.fixture(scope="module", params=["gs", "ms_d"])  # of ms, test_look
-def trained(request, mini, photographs, tmp_path_factory):
-    """16 iterations: split by mask, all points from depth at 6, simplified at 10 and at 13."""
-    out = tmp_path_factory.mktemp(request.param)
-    return request.param, out, run(command(mini, request.param, photographs, out, 16), OPTIONS)
-
-
-def test_every_script_is_fine_tuned_and_only_opacities_move(trained):
-    variant, _, summary = trained
-    check_stage_two(summary, "mini-splatting", 6)
-    before = read_ply(summary.model_before)
-    assert before.sh_degree == 1  # though ms and ms_d begin without a second band
-    assert (len(before.xyz) != 150) or variant == "gs"
+def command(mini, scene, out, iterations, *more):
+    return runs.command(mini / "ms/train.py", scene, out, iterations, *FLAGS, *more)
 
 
 def test_the_metric_without_its_weights_is_said_once(mini, photographs, tmp_path, caplog):
     with caplog.at_level(logging.WARNING, logger="fragprune"):
         more = ["--test_iterations", 2, 3]
-        run(command(mini, "ms", photographs, tmp_path, 4, *more), replace(OPTIONS, stage="off"))
+        run(command(mini, photographs, tmp_path, 4, *more), replace(OPTIONS, stage="off"))
     said = [record for record in caplog.records if "lpipsPyTorch:lpips" in record.getMessage()]
     assert len(said) == 1
     assert "no way there" in said[0].getMessage()
@@ -122,7 +100,7 @@ def test_an_interrupted_run_saves_at_its_iteration_whatever_the_hosts_clock_says
 ):
     plug(InterruptAt(3))
     with pytest.raises(Interrupted):
-        run(command(mini, "ms", photographs, tmp_path, 16), OPTIONS)
+        run(command(mini, photographs, tmp_path, 16), OPTIONS)
     (saved,) = tmp_path.glob("point_cloud/*/*.safetensors")
     assert saved.parent.name == "iteration_19"  # 16 and 3 steps; the host's own clock is at 5009
 
@@ -133,7 +111,7 @@ def test_another_package_of_the_hosts_name_is_refused(mini, photographs, tmp_pat
     (tmp_path / "scene/__init__.py").write_text("class Scene:\n    def __init__(self): ...\n")
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(SeamError, match="a module of the same name"):
-        run(command(mini, "ms", photographs, tmp_path / "out", 16), OPTIONS)
+        run(command(mini, photographs, tmp_path / "out", 16), OPTIONS)
     sys.modules.pop("scene", None)
 
 

@@ -44,23 +44,12 @@ class Added:
     """Methods of GaussianModel that vanilla does not have, or has otherwise."""
 
     def replace_tensors_to_optimizer(self, inds=None):
-        tensors = {
-            "xyz": self._xyz,
-            "f_dc": self._features_dc,
-            "f_rest": self._features_rest,
-            "opacity": self._opacity,
-            "scaling": self._scaling,
-            "rotation": self._rotation,
-        }
-
         def emptied(moment):
             moment[slice(None) if inds is None else inds] = 0
             return moment
 
         groups = self.optimizer.param_groups
-        renewed = {
-            g["name"]: self._replace(g, tensors[g["name"]].detach(), emptied) for g in groups
-        }
+        renewed = {g["name"]: self._replace(g, g["params"][0].detach(), emptied) for g in groups}
         self._adopt(renewed)
         return renewed
 
@@ -90,8 +79,7 @@ class Added:
         if not len(dead) or not len(alive):
             return
         parents, ratio = self._sample_alives(self.get_opacity[alive, 0], len(dead), alive)
-        own = (self._xyz, self._features_dc, self._features_rest)
-        own = (*own, self._opacity, self._scaling, self._rotation)
+        own = [group["params"][0] for group in self.optimizer.param_groups]
         for tensor, new in zip(own, self._update_params(parents, ratio), strict=True):
             tensor[dead] = new
         for tensor in (self._opacity, self._scaling):

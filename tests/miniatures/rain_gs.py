@@ -176,16 +176,7 @@ class RainHost(Descendant):
             number = 3 if chance.heads else 2
             model.densify_and_split(grads, 1 - chance.share / 2, 1e-6, N=number, abe_split=True)
 
-        def both(model: Any, arguments: Any, chance: Any) -> None:
-            prune = type(model).densify_and_prune
-
-            def once(*args: Any, **options: Any) -> None:
-                prune(model, *args, **options, abe_split=chance.seed % 3 == 0)
-
-            model.densify_and_prune = once
-            try:
-                densify_and_prune(model, arguments, chance)
-            finally:
-                del model.densify_and_prune
+        def both(*given: Any) -> None:
+            densify_and_prune(*given, 2, given[-1].seed % 3 == 0)
 
         return {**super().actions(), "far split": far, "densify and prune": both}
