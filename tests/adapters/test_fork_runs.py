@@ -9,7 +9,6 @@ from miniatures.changed import ForkHost
 from miniatures.runs import OPTIONS, check_stage_two, edit, frozen_differences
 
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.injection.launch import run
 
 RATES = "        gaussians.update_learning_rate(iteration)\n"
@@ -75,7 +74,7 @@ def test_two_models_of_one_script_learn_each_its_own_thresholds(fork, photograph
             tmp_path / f"out/{name}/iteration_{each}/point_cloud.ply" for each in (13, 21)
         )
         stores.append(sidecar.load(last)[0])
-        assert frozen_differences(first, last, read_ply) == []
+        assert frozen_differences(first, last) == []
         assert not stores[-1].neutral
     assert not torch.equal(stores[0].logits, stores[1].logits)
     assert summary.gaussians == len(stores[0])

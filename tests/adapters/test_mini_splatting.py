@@ -10,7 +10,7 @@ import pytest
 import torch
 from miniatures import runs
 from miniatures.mini_splatting import MiniSplattingHost
-from miniatures.runs import miniature
+from miniatures.runs import OPTIONS, miniature
 from miniatures.vanilla_3dgs import HOST, InterruptAt, joint, label, running
 
 from fragprune_mini_splatting import MiniSplatting
@@ -18,8 +18,7 @@ from fragprune_plugins.adapting import HostRepo
 from fragprune_plugins.errors import AlignmentError, Interrupted, SeamError, UnknownHostError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.hosts.choosing import choose, locate
-from fragprune_plugins.injection.launch import RunOptions, run
-from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.injection.launch import run
 from fragprune_plugins.plugins.loading import load_plugins
 
 mini, of = miniature(MiniSplattingHost, MiniSplatting)
@@ -76,9 +75,6 @@ FLAGS = [
     *("--densify_until_iter", 10, "--simp_iteration1", 10, "--simp_iteration2", 13),
     *("--depth_interval", 6, "--num_depth", 240, "--imp_metric", "indoor"),
 ]
-OPTIONS = RunOptions(
-    device="cpu", settings=Settings(iterations=6, threshold_lr=0.3, train="opacity")
-)
 
 
 def command(mini, scene, out, iterations, *more):

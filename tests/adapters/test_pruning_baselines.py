@@ -10,7 +10,7 @@ import torch
 from miniatures import runs
 from miniatures.compact_3dgs import CompactHost
 from miniatures.lp_3dgs import LPHost
-from miniatures.runs import check_stage_two, edit, miniature, written
+from miniatures.runs import OPTIONS, check_stage_two, edit, miniature, written
 from miniatures.speedy_splat import SpeedyHost
 from miniatures.vanilla_3dgs import joint, running
 from plyfile import PlyData
@@ -20,14 +20,8 @@ from fragprune_lp_3dgs import LP3DGS
 from fragprune_plugins.adapting import HostRepo, SeamCall, read_ply
 from fragprune_plugins.errors import EngineError, HostFailed, UsageError
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.injection.launch import RunOptions, run
-from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.injection.launch import run
 from fragprune_speedy_splat import SpeedySplat
-
-OPTIONS = RunOptions(
-    device="cpu", settings=Settings(iterations=6, threshold_lr=0.3, train="opacity")
-)
-
 
 speedy, _ = miniature(SpeedyHost, SpeedySplat)
 lp, _ = miniature(LPHost, LP3DGS)
@@ -60,7 +54,7 @@ def test_speedys_pruning_is_refused_and_never_gets_zeros(speedy, photographs, tm
 def test_stage_two_of_speedy_prunes_nothing(speedy, photographs, tmp_path):
     more = ["--prune_interval", 14, "--checkpoint_iterations", 12]  # due in stage 2, at 14
     summary = run(command(speedy, photographs, tmp_path, 12, *more), OPTIONS)
-    check_stage_two(summary, "speedy-splat", 6)
+    check_stage_two(summary, "speedy-splat")
 
 
 # -- LP-3DGS -------------------------------------------------------------------------------------
@@ -80,7 +74,7 @@ def test_lp_prunes_by_the_weights_of_what_is_drawn(lp, photographs, tmp_path):
             replace(OPTIONS, stage="off"),
         )
     summary = run(words, replace(OPTIONS, stage="finetune"))
-    check_stage_two(summary, "lp-3dgs", 6)
+    check_stage_two(summary, "lp-3dgs")
     rows = len(read_ply(summary.model_before).xyz)
     assert len(read_ply(pruned).xyz) == rows - int(0.3 * (rows - 1)) - 1
 

@@ -123,14 +123,25 @@ class Added:
         self._adopt({"mask": torch.ones_like(self._opacity)})
 
     def training_setup(self, training_args):
-        self.vanilla_training_setup(training_args)
-        xyz, _, _, *others = self.optimizer.param_groups
-        mask = {"params": [self._mask], "lr": training_args.mask_lr, "name": "mask"}
-        self.optimizer = torch.optim.Adam([xyz, *others, mask], lr=0.0, eps=1e-15)
+        self.percent_dense = training_args.percent_dense
+        self._reset_statistics()
+        rate = training_args.position_lr_init * self.spatial_lr_scale
+        rates = {
+            "xyz": (self._xyz, rate),
+            "opacity": (self._opacity, training_args.opacity_lr),
+            "scaling": (self._scaling, training_args.scaling_lr),
+            "rotation": (self._rotation, training_args.rotation_lr),
+            "mask": (self._mask, training_args.mask_lr),
+        }
+        groups = [{"params": [p], "lr": lr, "name": name} for name, (p, lr) in rates.items()]
+        self.optimizer = torch.optim.Adam(groups, lr=0.0, eps=1e-15)
         nets = [*self.recolor.parameters(), *self.mlp_head.parameters()]
         self.optimizer_net = torch.optim.Adam(nets, lr=training_args.net_lr, eps=1e-15)
         self.scheduler_net = torch.optim.lr_scheduler.MultiStepLR(
             self.optimizer_net, milestones=training_args.net_lr_step, gamma=0.33
+        )
+        self.xyz_scheduler_args = get_expon_lr_func(  # noqa: F821
+            rate, rate / 100, training_args.position_lr_max_steps
         )
 
     def _adopt(self, tensors):

@@ -64,30 +64,26 @@ def command(script: Path, scene: object, out: object, iterations: int, *more: ob
     return [str(word) for word in words]
 
 
-def frozen_differences(
-    before: Path, after: Path, read: Callable[[Path], Any] = read_ply
-) -> list[str]:
+def frozen_differences(before: Path, after: Path) -> list[str]:
     """In which tensors two files of a model differ, opacities aside."""
-    one, other = read(before), read(after)
+    one, other = read_ply(before), read_ply(after)
     return [name for name in FROZEN if not torch.equal(getattr(one, name), getattr(other, name))]
 
 
-def check_stage_two(
-    summary: Any, adapter: str, iterations: int = 8, read: Callable[[Path], Any] = read_ply
-) -> None:
+def check_stage_two(summary: Any, adapter: str) -> None:
     """Of a finished run with ``OPTIONS``: opacities moved alone, each row has its threshold."""
     before, after = summary.model_before, summary.model_after
-    assert (summary.adapter, summary.steps) == (adapter, iterations)
-    assert frozen_differences(before, after, read) == []
-    assert not torch.equal(read(before).opacity, read(after).opacity)
+    assert (summary.adapter, summary.steps) == (adapter, 8)
+    assert frozen_differences(before, after) == []
+    assert not torch.equal(read_ply(before).opacity, read_ply(after).opacity)
     store, info = sidecar.load(after)
-    assert len(store) == info.rows == summary.gaussians == len(read(after).opacity)
-    assert (info.adapter, store.steps, store.neutral) == (adapter, iterations, False)
+    assert len(store) == info.rows == summary.gaussians == len(read_ply(after).opacity)
+    assert (info.adapter, store.steps, store.neutral) == (adapter, 8, False)
     assert summary.fragments_after < summary.fragments_before
 
 
 def check_measured(
-    summary: Any, picture: Path, photographs: Path, read: Callable[[Path], Any] = read_ply
+    summary: Any, picture: Path, photographs: Path, read: Callable[[Path], Any]
 ) -> None:
     """The picture of the one held-out view that a host's script rendered is what we measure."""
     values = sidecar.load(summary.model_after)[0].values.detach()
