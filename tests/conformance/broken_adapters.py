@@ -115,6 +115,15 @@ class LetsMomentsBeInherited(MCMC):
     )
 
 
+class SavesNothing(Vanilla3DGS):
+    """Does not know where the host saves."""
+
+    seams = revised(
+        Vanilla3DGS.seams,
+        {"GaussianModel.save_ply": {"attribute": "GaussianModel.oneupSHdegree", "needs": ()}},
+    )
+
+
 class ReadsNoSource(Vanilla3DGS):
     """Takes any call of the rasterizer for the one it answers."""
 

@@ -39,6 +39,7 @@ def case(adapter, **options):
         (invariants.freeze, broken.LeavesParametersAsleep, "left other parameters asking"),
         (invariants.freeze, broken.LetsItGrow, "densify and prune made "),
         (invariants.freeze, broken.LetsItReset, "reset opacity changed opacity"),
+        (invariants.model_file, broken.SavesNothing, "no sidecar was written"),
         (invariants.refuse, broken.FitsEverything, "still taken for the host"),
         (invariants.refuse, broken.ReadsNoSource, "takes one value more"),
         (invariants.same_picture, broken.DrawsOtherwiseEachTime, "other fragments drawn"),
