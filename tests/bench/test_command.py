@@ -75,19 +75,6 @@ def test_a_model_of_ones_own_with_its_thresholds(tmp_path: Path, learned: bool) 
     assert timing.TRUNCATION < 0.1
 
 
-@pytest.mark.parametrize("arguments", [("--size", "40"), ("--size", "0x9")])
-def test_usage(arguments: tuple[object, ...]) -> None:
-    assert run("bench", *arguments).exit_code == 2
-
-
-def test_an_option_without_effect_on_a_model_is_refused(tmp_path: Path) -> None:
-    model = tmp_path / "mine.ply"
-    write_ply(model, tiny.random_model())
-    result = run("bench", model, "--gaussians", 5, "--cameras", cameras_file(tmp_path))
-    assert result.exit_code == 2
-    assert "--gaussians with" in result.stderr
-
-
 def test_a_system_without_a_load_average(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr("os.getloadavg")
     assert "load unknown" in run("bench", *SMALL).stdout

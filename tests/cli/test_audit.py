@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 import torch
-from cli.commands import fails, run, run_json
+from cli.commands import run, run_json
 from finetune import tiny
 from PIL import Image
 
@@ -153,10 +153,3 @@ def test_a_pruned_model_says_what_its_thresholds_save(tmp_path):
     plain = run_json("audit", path, "--out", tmp_path / "out", "--no-truncation", *words)
     assert plain["truncated"] is False
     assert plain["fragments_per_pixel"] == report["cuts"][-1]["fragments_per_pixel"]
-
-
-@pytest.mark.parametrize("side", ["--orbit", "--inside"])
-def test_two_sources_of_cameras_are_refused(model, tmp_path, side):
-    asked = ("audit", model, "--data", tmp_path, side, "--out", tmp_path / "out")
-    fails(*asked, says=f"--data with {side}")
-    assert not (tmp_path / "out").exists()

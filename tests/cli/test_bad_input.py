@@ -1,6 +1,7 @@
 """Each bad input has one message, exit code 1, and touches nothing that was there."""
 
 import json
+from itertools import combinations
 
 import pytest
 import torch
@@ -103,6 +104,24 @@ def test_the_model_itself_is_no_output(scene, command):
     assert path.read_bytes() == before
 
 
+FINETUNE = "finetune FILE --out out.ply"
+GOALS = (
+    *("--control", "--portable", "--pressure 1e-4"),
+    *("--target-speedup 2", "--target-time 2", "--max-drop 0.1"),
+)
+OUT_OF_RANGE = {
+    "--iters": [0],
+    "--pressure": [5],
+    "--target-speedup": [1],
+    "--target-time": [21],
+    "--stop": [3],
+    "--dropout": [0.95],
+    "--max-drop": [-1, 11, "much"],
+    "--keep": [0, 1.5, "x", "nan"],
+    "--log": ["csv", "csv:", "paper:x", ":x", "bar:3"],
+}
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [
@@ -112,28 +131,59 @@ def test_the_model_itself_is_no_output(scene, command):
         ("bridge babylon", "playcanvas or spark"),
         ("run --config no.toml -- python train.py", "no such file"),
         ("run --target-time 1.5 -- train.py", "--target-speedup"),
+        ("run --max-drop 2 -- train.py", "No such option"),
+        ("run --quick --iters 10 -- train.py", "--quick with --iters"),
+        ("run --control --target-speedup 2 -- train.py", "--control with --target-speedup"),
         ("run --from-iter 5 -- train.py", "--stage finetune or joint"),
         ("run --from-iter 5 --stage off -- train.py", "--stage finetune or joint"),
-        ("finetune FILE --self --out out.ply --max-drop 0.1", "--self with --max-drop"),
+        (f"{FINETUNE} --quick --iters 10", "--quick with --iters"),
+        (f"{FINETUNE} --max-drop 0.1 --log csv:steps.csv", "--log with --max-drop"),
+        (f"{FINETUNE} --self --max-drop 0.1", "--self with --max-drop"),
+        (f"{FINETUNE} --self --control", "--self with --control"),
+        (f"{FINETUNE} --self --keep auto", "--self with --keep auto"),
+        (f"{FINETUNE} --self --data d --cameras c", "--data with --cameras"),
+        (f"{FINETUNE} --cameras c", "--cameras without --self"),
+        (FINETUNE, "Pass --data FOLDER with photographs"),
+        *(
+            (
+                f"{FINETUNE} {one} {other}",
+                f"{one.split()[0]} with {other.split()[0]}; expected one goal",
+            )
+            for one, other in combinations(GOALS, 2)
+            if (one, other) != ("--portable", "--pressure 1e-4")
+        ),
+        *(
+            (f"{FINETUNE} {option} {value}", option)
+            for option, values in OUT_OF_RANGE.items()
+            for value in values
+        ),
         ("finetune FILE --out pruned.txt", "'pruned.txt' does not end with .ply"),
         ("finetune FILE --out pruned", "'pruned' does not end with .ply"),
         ("export FILE --out pruned.obj", "'pruned.obj' does not end with .ply"),
+        ("export FILE FILE --out o.ply --no-truncation", "PRUNED with --no-truncation"),
         ("report d --out page.pdf", "'page.pdf' does not end with .html"),
-        ("view FILE --data x --cameras y", "--cameras"),
+        ("view FILE --data x --cameras y", "--cameras with --data"),
         ("view FILE --port 70000", "--port"),
-        ("finetune FILE --out out.ply --dropout 0.95", "--dropout"),
-        *(
-            (f"finetune FILE --out out.ply --log {log}", "--log")
-            for log in ("csv", "csv:", "paper:x", ":x", "bar:3")
-        ),
+        ("audit FILE --out o --data x --orbit", "--data with --orbit"),
+        ("audit FILE --out o --data x --inside", "--data with --inside"),
+        ("render FILE --out o", "neither --cameras, --data nor --orbit"),
+        ("render FILE --orbit --out o.gif", "o.gif"),
+        ("render FILE --out o --data x --cameras y", "--cameras with --data"),
+        ("render FILE --out o --cameras y --views train", "--views without --data"),
+        ("render FILE --out o --cameras y --images i", "--images without --data"),
         *(
             (f"render FILE --orbit --out a.mp4 --up {up}", "--up")
             for up in ("1,2", "a,b,c", "0,0,0", "nan,0,1", "inf,0,0")
         ),
+        ("bench FILE --cameras c --gaussians 5", "--gaussians with MODEL"),
+        ("bench --size 40", "--size"),
+        ("bench --size 0x9", "--size"),
     ],
 )
-def test_words_that_make_no_sense_are_usage(words, says):
+def test_words_that_make_no_sense_are_usage(words, says, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     fails(*words.replace("FILE", __file__).split(), says=says)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_failed_write_touches_nothing(scene, monkeypatch):

@@ -123,12 +123,6 @@ def test_a_model_without_cutoffs_has_none_to_give(tmp_path, pruned):
     fails(*asked, says="plain.ply: a model without cutoffs", code=1)
 
 
-def test_cutoffs_cannot_be_given_back_and_left_out_at_once(tmp_path, pruned):
-    path = tmp_path / "pruned.ply"
-    asked = ("export", path, path, "--no-truncation", "--out", tmp_path / "out.ply")
-    fails(*asked, says="PRUNED with --no-truncation")
-
-
 def test_the_model_that_gives_cutoffs_is_not_overwritten(tmp_path, pruned):
     path, before = tmp_path / "pruned.ply", (tmp_path / "pruned.ply").read_bytes()
     write_ply(tmp_path / "edited.ply", edited(pruned, torch.arange(9)))

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from cli.commands import fails, run, run_json
+from cli.commands import fails, run_json
 from finetune import tiny
 
 import fragprune_plugins as fp
@@ -116,28 +116,6 @@ def test_the_target_is_what_the_model_shows_as_it_came_in(scene, falloff):
     assert not torch.equal(shot.image, other)
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ((), ("no folder", "Pass --data FOLDER with photographs", "--self")),
-        (("--cameras", "c.json"), ("--cameras without --self", "Add --self")),
-        (
-            ("--self", "--data", "scene", "--cameras", "c.json"),
-            ("--data with --cameras", "Drop one of the two"),
-        ),
-        (("--self", "--control"), ("--self with --control", "Drop one of the two")),
-    ],
-)
-def test_what_contradicts_itself_is_refused_with_a_remedy(scene, tmp_path, options, words):
-    _, path, _ = scene
-    out = tmp_path / "out.ply"
-    result = run("finetune", path, "--out", out, *options)
-    assert result.exit_code == 2
-    for word in words:
-        assert word in result.stderr
-    assert not out.exists()
-
-
 def test_a_single_camera_is_too_few(scene, cameras, tmp_path):
     _, path, _ = scene
     cameras.write_text(json.dumps(json.loads(cameras.read_text())[:1]))
@@ -153,11 +131,3 @@ def test_in_python_needs_no_cameras(scene):
     image = dataset.test[0].image
     assert image.shape == (3, 800, 800)
     assert float(image.max()) > 0.1
-
-
-def test_a_file_of_options_says_it(scene, tmp_path):
-    data, path, _ = scene
-    config = tmp_path / "options.toml"
-    config.write_text("self = true\niters = 2\n")
-    arguments = ("finetune", path, "--data", data, "--out", tmp_path / "out.ply")
-    assert run_json(*arguments, "--config", config)["target"] == "itself"

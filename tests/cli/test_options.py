@@ -1,11 +1,17 @@
-"""What commands make of words that are misspelt, missing or without effect."""
+"""What commands make of their options: rules, defaults, words that are missing."""
 
+import click
 import pytest
 from cli.commands import fails, run, run_json
+from click.testing import CliRunner
 from finetune import tiny
 from PIL import Image
 
-from fragprune_plugins.workbench.commands import cli
+from fragprune_plugins.plugins.points import load, offered
+from fragprune_plugins.workbench.commands import GROUP, cli
+from fragprune_plugins.workbench.commands.command import Command, Report
+from fragprune_plugins.workbench.commands.learning import learning_options
+from fragprune_plugins.workbench.commands.rules import Alone, Needs
 
 
 @pytest.mark.parametrize(
@@ -24,39 +30,85 @@ def test_a_model_that_is_not_there_is_what_is_wrong(name, tmp_path):
     assert not out.exists()
 
 
-@pytest.fixture
-def given(tmp_path):
-    """A model, and its cameras in a file."""
-    _, path, _ = tiny.scene(tmp_path)
-    return path, tiny.write_path(tmp_path / "path.json", ["a", "b"])
-
-
-def test_cameras_of_a_file_are_divided(given, tmp_path):
-    model, cameras = given
-    out = tmp_path / "pictures"
+def test_cameras_of_a_file_are_divided(tmp_path):
+    _, model, _ = tiny.scene(tmp_path)
+    cameras, out = tiny.write_path(tmp_path / "path.json", ["a", "b"]), tmp_path / "pictures"
     run_json("render", model, "--cameras", cameras, "--out", out, "--resolution", 2)
     with Image.open(out / "a.png") as picture:
         assert picture.size == (10, 6)
 
 
-@pytest.mark.parametrize("words", [("--views", "train"), ("--images", "images_2")])
-def test_options_of_photographs_are_refused_beside_cameras(given, tmp_path, words):
-    model, cameras = given
-    out = tmp_path / "pictures"
-    fails("render", model, "--cameras", cameras, "--out", out, *words, says=f"{words[0]}")
-    assert not out.exists()
-
-
-@pytest.mark.parametrize("name", ["o.gif", "film.mp4"])
-def test_a_film_that_cannot_be_written_is_refused_before_it_is_drawn(
-    given, tmp_path, name, monkeypatch
-):
-    monkeypatch.setitem(__import__("sys").modules, "imageio_ffmpeg", None)
-    monkeypatch.setattr("fragprune_plugins.workbench.render.work.load", None)
-    result = run("render", given[0], "--orbit", "--out", tmp_path / name)
-    assert result.exit_code == 2
-    assert not (tmp_path / name).exists()
-
-
 def test_the_list_of_commands_cuts_no_sentence():
     assert "..." not in run("--help").stdout.split("Commands:")[1]
+
+
+@pytest.mark.parametrize(
+    ("options", "iterations", "warmup"),
+    [
+        *(((), 5000, 3000), (("--views", 4), 1250, 750), (("--self",), 1000, 0)),
+        (("--views", 4, "--iters", 900), 900, 400),
+    ],
+)
+def test_steps_are_fewer_where_each_sees_more_views_or_no_photograph(options, iterations, warmup):
+    @click.command()
+    @click.option("--views", "views_per_step", default=1)
+    @click.option("--self", "itself", is_flag=True)
+    @learning_options(every_goal=True)
+    def show(settings, **_):
+        click.echo(f"{settings.iterations} {settings.warmup} {settings.views_per_step}")
+
+    views = options[1] if "--views" in options else 1
+    said = CliRunner().invoke(show, list(map(str, options))).stdout.split()
+    assert said == [str(iterations), str(warmup), str(views)]
+
+
+RULES = (
+    Alone(("--flag", "--number"), "one of them"),
+    Alone(("--word *.gif", "--flag")),
+    Needs("--number", ("--word far", "THING"), "a far word or a thing"),
+)
+
+
+@click.command("ruled", cls=Command, rules=RULES)
+@click.argument("thing", required=False)
+@click.option("--flag", is_flag=True)
+@click.option("--number", default=3)
+@click.option("--word", default="near")
+def ruled(**_) -> Report:
+    return Report({}, "done")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--flag", "done"),
+        ("--number 3 here", "done"),
+        ("--number 3 --word far", "done"),
+        ("--word a.gif", "done"),
+        ("--flag --number 3 here", "--flag with --number; expected one of them. Drop one of"),
+        ("--word A.GIF --flag", "--word *.gif with --flag"),
+        (
+            "--number 3",
+            "--number without --word far or THING; expected a far word or a thing. "
+            "Add --word far, or drop --number.",
+        ),
+    ],
+)
+def test_what_is_given_is_told_from_defaults(words, said):
+    result = CliRunner().invoke(ruled, words.split())
+    assert said in result.output
+    assert result.exit_code == (0 if said == "done" else 2)
+
+
+def test_every_rule_names_options_that_a_command_has():
+    commands = [load(point, click.Command) for point in offered(GROUP).values()]
+    known = {
+        word
+        for each in commands
+        for param in each.params
+        for word in (*param.opts, *param.secondary_opts, param.human_readable_name)
+    }
+    for command in commands:
+        for rule in getattr(command, "rules", ()):
+            names = rule.names if isinstance(rule, Alone) else (rule.name, *rule.others)
+            assert {name.split(" ")[0] for name in names} <= known, command.name

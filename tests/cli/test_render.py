@@ -80,11 +80,3 @@ def test_a_view_that_shows_nothing_is_warned_of(cut_scene, tmp_path):
     words = ("render", path, "--cameras", tmp_path / "path.json", "--out", tmp_path / "pictures")
     assert "Warning: 1 of 2 show no Gaussian" in run(*words).stdout
     assert len(run_json(*words)["warnings"]) == 1
-
-
-def test_needs_exactly_one_source_of_cameras(cut_scene, tmp_path):
-    data, path = cut_scene
-    assert run("render", path, "--out", tmp_path / "x").exit_code == 2
-    both = run("render", path, "--out", tmp_path / "x", "--data", data, "--cameras", data)
-    assert both.exit_code == 2
-    assert not (tmp_path / "x").exists()

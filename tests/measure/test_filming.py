@@ -115,5 +115,6 @@ def test_an_orbit_can_be_pictures(tmp_path, monkeypatch):
 def test_without_the_library_the_message_says_what_to_install(tmp_path, monkeypatch):
     _, model, _ = tiny.scene(tmp_path)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    monkeypatch.setattr(work, "load", None)  # refused before it is drawn
     fails("render", model, "--orbit", "--out", tmp_path / "a.mp4", says="fragprune-plugins[video]")
     assert not (tmp_path / "a.mp4").exists()
