@@ -26,12 +26,6 @@ def run_error(*arguments: object, code: int = 1) -> dict:
     return json.loads(result.stdout)["error"]
 
 
-def finetune_words(scene: tuple, out: object, *more: object) -> tuple:
-    """A short fine-tuning of a model on its photographs."""
-    data, path = scene
-    return ("finetune", path, "--data", data, "--out", out, "--iters", 20, *more)
-
-
 def drawing(data: Path, path: Path, cameras: Path, out: Path) -> dict[str, tuple]:
     """Commands that draw a model, and what each needs."""
     return {

@@ -5,7 +5,6 @@ import re
 
 import numpy as np
 import pytest
-import torch
 from cli.commands import run, run_json
 from finetune import tiny
 from PIL import Image
@@ -75,9 +74,8 @@ def test_maps_have_the_views_pixels_and_one_scale(audited):
         assert means[1:] == pytest.approx(expected, rel=0.05, abs=1)
 
 
-def test_as_text_the_result_comes_first(model, audited, tmp_path):
-    words = ("--views", 1, "--resolution", 16, "--orbit")
-    result = run("audit", model, "--out", tmp_path / "out", *words)
+def test_as_text_the_result_comes_first(model):
+    result = run("audit", model, "--views", 1, "--resolution", 16, "--orbit")
     assert result.exit_code == 0
     first, *others = result.stdout.splitlines()
     assert re.match(r"60 Gaussians draw [\d.]+ fragments per pixel, [\d.]+ ms a frame", first)
@@ -92,24 +90,14 @@ def test_as_text_the_result_comes_first(model, audited, tmp_path):
 
 def test_without_a_folder_there_is_the_table_alone(model, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    words = ("--views", 1, "--resolution", 16, "--orbit")
-    result = run("audit", model, *words)
-    assert result.exit_code == 0
-    assert "PlayCanvas " in result.stdout
-    report = run_json("audit", model, *words)
+    report = run_json("audit", model, "--views", 1, "--resolution", 16, "--orbit")
     assert (report["page"], report["maps"]) == (None, None)
     assert not list(tmp_path.iterdir())
 
 
 def test_given_cameras_need_no_photographs(model, tmp_path):
-    images = tiny.photographs(tiny.random_model())
-    data = tiny.write_blender(tmp_path / "data", images)
-    transforms = data / "transforms_train.json"
-    content = json.loads(transforms.read_text()) | {"w": tiny.SIDE, "h": tiny.SIDE}
-    transforms.write_text(json.dumps(content))
-    for picture in data.rglob("*.png"):
-        picture.unlink()
-    given = ("--cameras", transforms, "--views", 3)
+    cameras = tiny.write_path(tmp_path / "cameras.json", tiny.NAMES[:7], tiny.SIDE, tiny.SIDE)
+    given = ("--cameras", cameras, "--views", 3)
     report = run_json("audit", model, *given, "--out", tmp_path / "out")
     assert report["cameras"]["kind"] == "given"
     assert "3 of the 7 cameras" in report["cameras"]["why"]
@@ -124,32 +112,28 @@ def test_the_command_that_it_advises_takes_the_photographs_that_it_was_given(mod
     assert f"fragprune finetune {model} --self --out pruned.ply. No photographs" in alone
 
 
-def test_the_cameras_of_its_training_are_taken_unless_others_are_asked_for(model, tmp_path):
-    path = tmp_path / "run" / "point_cloud" / "iteration_5" / "point_cloud.ply"
-    path.parent.mkdir(parents=True)
-    path.write_bytes(model.read_bytes())
-    (tmp_path / "run" / "cfg_args").write_text("Namespace(source_path='scene')")
-    camera = {"id": 0, "img_name": "a", "width": 3300, "height": 33, "fx": 3000.0, "fy": 3000.0}
-    pose = {"position": [0.0, 0.0, -3.0], "rotation": torch.eye(3).tolist()}
-    (tmp_path / "run" / "cameras.json").write_text(json.dumps([camera | pose]))
+def test_the_cameras_of_its_training_are_taken_unless_others_are_asked_for(tmp_path):
+    run = tiny.host_output(tmp_path / "run", tmp_path / "scene", tiny.random_model())
+    (camera,) = json.loads((run / "cameras.json").read_text())
+    camera |= {"width": 3300, "height": 33, "fx": 3000.0, "fy": 3000.0}
+    (run / "cameras.json").write_text(json.dumps([camera]))
     out = ("--out", tmp_path / "out")
-    report = run_json("audit", tmp_path / "run", *out)
-    assert (report["cameras"]["kind"], report["model"]) == ("given", str(path))
+    report = run_json("audit", run, *out)
+    assert report["cameras"]["kind"] == "given"
     assert report["maps"]["views"][0]["width"] == 1100  # of 3300: thrice less, not to be too large
     for side in ("orbit", "inside"):
-        asked = run_json("audit", path, f"--{side}", "--views", 1, "--resolution", 16, *out)
+        asked = run_json("audit", run, f"--{side}", "--views", 1, "--resolution", 16, *out)
         assert asked["cameras"]["kind"] == side
 
 
 def test_a_pruned_model_says_what_its_thresholds_save(tmp_path):
     path = tmp_path / "pruned.ply"
     write_ply(path, tiny.cut(tiny.random_model(), 0.3))
-    words = ("--views", 1, "--resolution", 16)
-    report = run_json("audit", path, "--out", tmp_path / "out", *words)
+    words = ("audit", path, "--views", 1, "--resolution", 16)
+    report = run_json(*words)
     assert report["truncated"] is True
-    assert re.search(
-        r"has cutoffs. With them it draws \d\.\d\dx fewer fragments", report["pruning"]
-    )
-    plain = run_json("audit", path, "--out", tmp_path / "out", "--no-truncation", *words)
+    saved = r"has cutoffs. With them it draws \d\.\d\dx fewer fragments"
+    assert re.search(saved, report["pruning"])
+    plain = run_json(*words, "--no-truncation")
     assert plain["truncated"] is False
     assert plain["fragments_per_pixel"] == report["cuts"][-1]["fragments_per_pixel"]

@@ -17,8 +17,7 @@ from fragprune_plugins.workbench.models.formats.ply import write_ply
 FIGURES = ("psnr", "ssim", "fragments_per_pixel", "gaussians")
 
 
-def test_two_models(tmp_path):
-    data, path, model = tiny.scene(tmp_path)
+def test_two_models(data, path, model, tmp_path):
     other = tmp_path / "other.ply"
     write_ply(other, tiny.cut(model, 0.3))
     report = run_json("compare", path, other, "--data", data, "--out", tmp_path / "pictures")
@@ -32,8 +31,7 @@ def test_two_models(tmp_path):
 
 
 @pytest.mark.parametrize(("silent", "shows"), [(0, True), (100, False)])
-def test_a_long_measurement_shows_how_far_it_is(tmp_path, monkeypatch, silent, shows):
-    data, path, _ = tiny.scene(tmp_path)
+def test_a_long_measurement_shows_how_far_it_is(data, path, monkeypatch, silent, shows):
     monkeypatch.setattr(evaluate, "SILENT", silent)
     result = run("compare", path, path, "--data", data)
     for words in ("measuring:", "timing frames:"):
@@ -41,8 +39,7 @@ def test_a_long_measurement_shows_how_far_it_is(tmp_path, monkeypatch, silent, s
         assert words not in result.stdout
 
 
-def test_a_model_of_which_nothing_is_seen_has_no_speedup(tmp_path):
-    data, path, model = tiny.scene(tmp_path)
+def test_a_model_of_which_nothing_is_seen_has_no_speedup(data, path, model, tmp_path):
     away = tmp_path / "away.ply"
     write_ply(away, replace(model, xyz=model.xyz + 1e4))
     report = run_json("compare", path, away, "--data", data)
@@ -52,9 +49,8 @@ def test_a_model_of_which_nothing_is_seen_has_no_speedup(tmp_path):
     assert "B against A: no fragments (" in text
 
 
-def test_frames_are_timed_at_another_size(tmp_path, monkeypatch):
+def test_frames_are_timed_at_another_size(data, path, tmp_path, monkeypatch):
     """Quality and fragments stay those of the photographs' size."""
-    data, path, _ = tiny.scene(tmp_path)
     plain = run_json("compare", path, path, "--data", data)
     sizes = []
 
@@ -74,8 +70,7 @@ def test_frames_are_timed_at_another_size(tmp_path, monkeypatch):
     assert ", frames of 3x the size 1.00 -> " in run_json("report", tmp_path / "out")["result"]
 
 
-def test_views_of_several_sizes_are_not_said_to_have_one(tmp_path):
-    data, path, _ = tiny.scene(tmp_path)
+def test_views_of_several_sizes_are_not_said_to_have_one(data, path):
     _, held_out = sorted((data / "images").iterdir())[::8]
     with Image.open(held_out) as picture:
         picture.resize((2 * tiny.SIDE, 2 * tiny.SIDE)).save(held_out)
@@ -84,9 +79,8 @@ def test_views_of_several_sizes_are_not_said_to_have_one(tmp_path):
     assert "Frames of 64x64 to 128x128 pixels." in text
 
 
-def test_without_photographs_b_is_compared_with_what_a_shows(tmp_path):
+def test_without_photographs_b_is_compared_with_what_a_shows(path, model, tmp_path):
     """Drawn here by hand: PSNR of B's pictures against A's, from the held-out cameras."""
-    _, path, model = tiny.scene(tmp_path)
     other = tmp_path / "other.ply"
     write_ply(other, tiny.cut(model, 0.3))
     cameras = tiny.write_path(tmp_path / "path.json", [f"v{i}" for i in range(9)], 24, 16)
@@ -104,9 +98,8 @@ def test_without_photographs_b_is_compared_with_what_a_shows(tmp_path):
     assert "PSNR against itself" in run("compare", path, other, "--cameras", cameras).stdout
 
 
-def test_what_finetune_self_wrote_is_compared_with_what_came_in(tmp_path):
+def test_what_finetune_self_wrote_is_compared_with_what_came_in(path, tmp_path):
     """The figures are those that finetune gave."""
-    _, path, _ = tiny.scene(tmp_path)
     other = tmp_path / "other.ply"
     words = ("--self", "--resolution", 16, "--iters", 5)
     learned = run_json("finetune", path, *words, "--out", other)
@@ -116,8 +109,7 @@ def test_what_finetune_self_wrote_is_compared_with_what_came_in(tmp_path):
         assert report["b"][key] == pytest.approx(learned["after"][key], rel=1e-5), key
 
 
-def test_profile_measures_against_the_models_own_pictures(tmp_path):
-    _, path, model = tiny.scene(tmp_path)
+def test_profile_measures_against_the_models_own_pictures(path, model):
     write_ply(path, tiny.cut(model, 0.3))
     report = run_json("profile", path, "--orbit", "--resolution", 16)
     assert report["target"] == "itself"
@@ -125,8 +117,7 @@ def test_profile_measures_against_the_models_own_pictures(tmp_path):
     assert 10 < report["psnr"] < 80
 
 
-def test_profile_has_a_column_with_thresholds_and_one_without(tmp_path):
-    data, path, model = tiny.scene(tmp_path)
+def test_profile_has_a_column_with_thresholds_and_one_without(data, path, model, tmp_path):
     plain = run_json("profile", path, "--data", data)
     assert plain["truncated"] is False
     assert list(plain["columns"]) == ["untruncated"]

@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 import torch
 from cli.commands import fails, run_json
-from cli.commands import finetune_words as words
 from finetune.several import at_step, command, needs_processes
 
 from fragprune_plugins.errors import DatasetError
@@ -24,10 +23,10 @@ def names(folder):
     return {each.name for each in folder.iterdir()}
 
 
-def test_the_first_process_writes_and_reports_and_the_others_say_nothing(scene, tmp_path):
+def test_the_first_process_writes_and_reports_and_the_others_say_nothing(tuning, tmp_path):
     one, two, log = tmp_path / "one.ply", tmp_path / "two.ply", tmp_path / "log.csv"
-    whole = run_json(*words(scene, one, "--views-per-step", 2))
-    first, second = command(2, *words(scene, two, "--json", "--log", f"csv:{log}"))
+    whole = run_json(*tuning(one, "--views-per-step", 2))
+    first, second = command(2, *tuning(two, "--json", "--log", f"csv:{log}"))
     assert (first.code, second.code) == (0, 0)
     code, out, err = first.left
     report = json.loads(out)
@@ -40,24 +39,24 @@ def test_the_first_process_writes_and_reports_and_the_others_say_nothing(scene, 
     assert report["after"]["psnr"] == whole["after"]["psnr"]
     with open(log) as file:
         assert [row["step"] for row in csv.DictReader(file)] == [str(n + 1) for n in range(20)]
-    again, other = command(2, *words(scene, two))
+    again, other = command(2, *tuning(two))
     assert "nothing was done" in again.left[1]
     assert other.left == (0, "", "")
 
 
 @pytest.mark.parametrize(("size", "killed"), [(2, 0), (3, 1)])
 def test_a_kill_of_one_ends_all_with_one_error_and_leaves_what_was_saved(
-    scene, tmp_path, size, killed
+    tuning, tmp_path, size, killed
 ):
     out = tmp_path / "out.ply"
-    run_json(*words(scene, out, "--iters", 3))
+    run_json(*tuning(out, "--iters", 3))
     before, files = out.read_bytes(), names(tmp_path)
 
     def prepare(rank):
         if rank == killed:
             at_step(7, lambda: os.kill(os.getpid(), signal.SIGKILL))
 
-    ended = command(size, *words(scene, out, "--again"), prepare=prepare)
+    ended = command(size, *tuning(out, "--again"), prepare=prepare)
     assert ended[killed].code == -signal.SIGKILL
     left = [each.left for rank, each in enumerate(ended) if rank != killed]
     assert [code for code, _, _ in left] == [1] * (size - 1)
@@ -69,7 +68,7 @@ def test_a_kill_of_one_ends_all_with_one_error_and_leaves_what_was_saved(
     assert names(tmp_path) - files == (locks if killed == 0 else set())
 
 
-def test_a_process_that_raises_takes_all_down_with_its_own_words(scene, tmp_path):
+def test_a_process_that_raises_takes_all_down_with_its_own_words(tuning, tmp_path):
     def unreadable():
         def image(shot):
             raise DatasetError(shot.name, "a torn page", "a photograph", "Scan it again.")
@@ -79,7 +78,7 @@ def test_a_process_that_raises_takes_all_down_with_its_own_words(scene, tmp_path
     files = names(tmp_path)
     ended = command(
         2,
-        *words(scene, tmp_path / "out.ply", "--json"),
+        *tuning(tmp_path / "out.ply", "--json"),
         prepare=lambda rank: at_step(5, unreadable) if rank == 1 else None,
     )
     (first, silent, _), (second, out, _) = (each.left for each in ended)
@@ -91,19 +90,19 @@ def test_a_process_that_raises_takes_all_down_with_its_own_words(scene, tmp_path
 @pytest.mark.parametrize(
     ("number", "more"), [(signal.SIGINT, ()), (signal.SIGTERM, ("--shard-gaussians",))]
 )
-def test_a_signal_to_one_ends_all_after_the_same_step(scene, tmp_path, number, more):
+def test_a_signal_to_one_ends_all_after_the_same_step(tuning, tmp_path, number, more):
     """Then one process goes on; shards go on as shards."""
     whole, out = tmp_path / "whole.ply", tmp_path / "out.ply"
 
     def again(place):
         if not more:
-            return run_json(*words(scene, place, "--views-per-step", 2))
-        return json.loads(command(2, *words(scene, place, *more, "--json"))[0].left[1])
+            return run_json(*tuning(place, "--views-per-step", 2))
+        return json.loads(command(2, *tuning(place, *more, "--json"))[0].left[1])
 
     again(whole)
     ended = command(
         2,
-        *words(scene, out, *more),
+        *tuning(out, *more),
         prepare=lambda rank: at_step(6, lambda: signal.raise_signal(number)) if rank == 1 else None,
     )
     (first, text, _), second = (each.left for each in ended)
@@ -118,54 +117,45 @@ def test_a_signal_to_one_ends_all_after_the_same_step(scene, tmp_path, number, m
     ("more", "found"),
     [
         (("--views-per-step", 3), "3 for 2 processes"),
-        (("--quick",), "--quick with --iters"),
         (("--shard-gaussians", "--portable"), "--shard-gaussians with --portable"),
-        (("--shard-gaussians", "--self"), "--shard-gaussians with --self"),
     ],
 )
-def test_what_is_refused_is_said_once(scene, tmp_path, more, found):
-    ended = command(2, *words(scene, tmp_path / "out.ply", *more))
+def test_what_is_refused_is_said_once(tuning, tmp_path, more, found):
+    ended = command(2, *tuning(tmp_path / "out.ply", *more))
     assert [each.left[0] for each in ended] == [2, 2]
     said = "".join(out + err for _, out, err in (each.left for each in ended))
     assert said.count(found) == 1
 
 
 @pytest.mark.parametrize("more", [("--max-drop", 0.5, "--keep", 0.9), ("--self",)])
-def test_what_goes_before_and_around_learning_is_the_same_in_both(scene, tmp_path, more):
+def test_what_goes_before_and_around_learning_is_the_same_in_both(tuning, tmp_path, more):
     one, two = tmp_path / "one.ply", tmp_path / "two.ply"
     more = (*more, "--iters", 3)
-    run_json(*words(scene, one, *more, "--views-per-step", 2))
-    first, second = command(2, *words(scene, two, *more, "--json"))
+    run_json(*tuning(one, *more, "--views-per-step", 2))
+    first, second = command(2, *tuning(two, *more, "--json"))
     assert (first.left[0], second.left) == (0, (0, "", ""))
     assert one.read_bytes() == two.read_bytes()
 
 
-def test_shards_write_and_report_as_one_process_does(scene, tmp_path):
+def test_shards_write_and_report_as_one_process_does(tuning, out):
     """What they learn is test_shards'."""
-    out, log = tmp_path / "out.ply", tmp_path / "log.csv"
-    more = ("--train", "opacity", "--shard-gaussians", "--iters", 2)
-    first, second = command(2, *words(scene, out, *more, "--json", "--log", f"csv:{log}"))
+    words = tuning(out, "--train", "opacity", "--shard-gaussians", "--iters", 2)
+    first, second = command(2, *words, "--json")
     code, printed, err = first.left
     assert (code, second.left) == (0, (0, "", "")), err
     report = json.loads(printed)
     assert report["shards"] == 2
     assert report["after"]["gaussians"] == len(read_ply(out)) == 60
-    with open(log) as file:
-        assert len(list(csv.DictReader(file))) == 2
-    text = command(2, *words(scene, out, *more, "--again"))[0].left[1]
+    text = command(2, *words, "--again")[0].left[1]
     assert "2 processes held a part of the Gaussians each" in text
 
 
-def test_one_process_has_nobody_to_share_gaussians_with(scene, tmp_path):
-    fails(*words(scene, tmp_path / "out.ply", "--shard-gaussians"), says="torchrun")
-
-
 @needs_processes
-def test_no_launcher_no_rendezvous(scene, tmp_path, monkeypatch):
+def test_no_launcher_no_rendezvous(tuning, tmp_path, monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "2")
     for name in ("RANK", "MASTER_ADDR", "MASTER_PORT"):
         monkeypatch.delenv(name, raising=False)
-    fails(*words(scene, tmp_path / "out.ply"), says="Start them with torchrun", code=1)
+    fails(*tuning(tmp_path / "out.ply"), says="Start them with torchrun", code=1)
 
 
 OFTEN = """
@@ -178,15 +168,14 @@ main()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("size", [2, 4])
-def test_torchrun_itself_ends_when_one_is_killed_and_goes_on(scene, tmp_path, size):
+def test_torchrun_itself_ends_when_one_is_killed_and_goes_on(tuning, tmp_path):
     """The same, with the real launcher, whose exit code is 1 then."""
     out, whole = tmp_path / "out.ply", tmp_path / "whole.ply"
     launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
     script = tmp_path / "often.py"
     script.write_text(OFTEN)
-    launcher += ["--nproc_per_node", str(size), str(script)]
-    line = [*launcher, *map(str, words(scene, out, "--iters", 300))]
+    launcher += ["--nproc_per_node", "2", str(script)]
+    line = [*launcher, *map(str, tuning(out, "--iters", 300))]
     with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as run_:
         children = Path(f"/proc/{run_.pid}/task/{run_.pid}/children")
         while not out.with_suffix(".fragprune-unfinished").exists():
@@ -204,9 +193,8 @@ def test_torchrun_itself_ends_when_one_is_killed_and_goes_on(scene, tmp_path, si
     assert done.returncode == 0, done.stderr
     assert "resuming at step" in done.stderr
     assert done.stdout.count("PSNR, dB") == 1
-    run_json(*words(scene, whole, "--iters", 300, "--views-per-step", size))
-    if size == 2:
-        assert out.read_bytes() == whole.read_bytes()
+    run_json(*tuning(whole, "--iters", 300, "--views-per-step", 2))
+    assert out.read_bytes() == whole.read_bytes()
     assert {name for name in names(tmp_path) if "out" in name or name[0] == "."} == {
         "out.ply",
         "out.fragprune.json",
@@ -215,15 +203,15 @@ def test_torchrun_itself_ends_when_one_is_killed_and_goes_on(scene, tmp_path, si
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("more", [(), ("--shard-gaussians",)])
-def test_two_gpus_learn_what_one_does_with_two_views_a_step(scene, tmp_path, more):
+def test_two_gpus_learn_what_one_does_with_two_views_a_step(tuning, tmp_path, more):
     """Replicas are compared at the end; sums on a GPU have no fixed order, so figures are near."""
     if torch.cuda.device_count() < 2:
         pytest.skip("needs two GPUs")
     one, two = tmp_path / "one.ply", tmp_path / "two.ply"
-    whole = run_json(*words(scene, one, "--views-per-step", 2, "--device", "cuda:0"))
+    whole = run_json(*tuning(one, "--views-per-step", 2, "--device", "cuda:0"))
     launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
     launcher += ["--nproc_per_node", "2", "-m", "fragprune_plugins"]
-    line = [*launcher, *map(str, words(scene, two, "--device", "cuda", "--json", *more))]
+    line = [*launcher, *map(str, tuning(two, "--device", "cuda", "--json", *more))]
     done = subprocess.run(line, capture_output=True, text=True, timeout=200)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)

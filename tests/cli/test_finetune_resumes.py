@@ -6,7 +6,6 @@ import signal
 
 import pytest
 from cli.commands import fails, run, run_json
-from cli.commands import finetune_words as words
 from finetune import tiny
 from finetune.several import at_step, ended
 
@@ -25,10 +24,10 @@ def killed(step, *arguments):
     assert ended(die) == -signal.SIGKILL
 
 
-def test_killed_twice_the_same_command_ends_with_the_same_files(scene, tmp_path):
+def test_killed_twice_the_same_command_ends_with_the_same_files(tuning, tmp_path):
     whole, out = tmp_path / "whole.ply", tmp_path / "out.ply"
-    assert run(*words(scene, whole)).exit_code == 0
-    arguments = words(scene, out)
+    assert run(*tuning(whole)).exit_code == 0
+    arguments = tuning(out)
     killed(7, *arguments)
     killed(19, *arguments)
     assert not out.exists()
@@ -44,39 +43,38 @@ def test_killed_twice_the_same_command_ends_with_the_same_files(scene, tmp_path)
 
 
 @pytest.mark.usefixtures("ctrl_c")
-def test_ctrl_c_is_gone_on_from_with_the_same_gaussians(scene, tmp_path, monkeypatch):
+def test_ctrl_c_is_gone_on_from_with_the_same_gaussians(tuning, tmp_path, monkeypatch):
     whole, out = tmp_path / "whole.ply", tmp_path / "out.ply"
-    assert run(*words(scene, whole, "--keep", 0.5)).exit_code == 0
+    assert run(*tuning(whole, "--keep", 0.5)).exit_code == 0
     tiny.at_loss(monkeypatch, 7, lambda: signal.raise_signal(signal.SIGINT))
-    result = run(*words(scene, out, "--keep", 0.5))
+    result = run(*tuning(out, "--keep", 0.5))
     assert result.exit_code == 130
     assert "The same command goes on from there." in result.stdout
-    assert run_json(*words(scene, out, "--keep", 0.5))["resumed_at"] == 7
+    assert run_json(*tuning(out, "--keep", 0.5))["resumed_at"] == 7
     assert out.read_bytes() == whole.read_bytes()
     assert not resuming.path_beside(out).exists()
 
 
-def test_a_finished_command_says_so_and_does_nothing(scene, tmp_path, monkeypatch):
+def test_a_finished_command_says_so_and_does_nothing(tuning, tmp_path, monkeypatch):
     out = tmp_path / "out.ply"
-    first = run_json(*words(scene, out, "--iters", 2))
+    first = run_json(*tuning(out, "--iters", 2))
     with monkeypatch.context() as patch:
         patch.setattr("fragprune_plugins.workbench.finetune.api.finetune", None)  # cannot be called
-        again = run_json(*words(scene, out, "--iters", 2))
+        again = run_json(*tuning(out, "--iters", 2))
         assert again == first | {"already_finished": True}
-        text = run(*words(scene, out, "--iters", 2))
+        text = run(*tuning(out, "--iters", 2))
     assert text.exit_code == 0
     assert "PSNR, dB" in text.stdout  # the whole report
     assert "was finished before: nothing was done. --again" in text.stdout
-    assert run_json(*words(scene, out, "--iters", 2, "--again"))["already_finished"] is False
+    assert run_json(*tuning(out, "--iters", 2, "--again"))["already_finished"] is False
 
 
 @pytest.mark.parametrize(
     "change", ["other options", "another model", "another photograph", "rewritten", "no record"]
 )
-def test_what_is_not_the_same_is_not_finished(scene, tmp_path, change):
-    data, path = scene
+def test_what_is_not_the_same_is_not_finished(tuning, data, path, tmp_path, change):
     out, more = tmp_path / "out.ply", []
-    run_json(*words(scene, out, "--iters", 2))
+    run_json(*tuning(out, "--iters", 2))
     if change == "other options":
         more = ["--pressure", 1e-3]
     elif change == "another model":
@@ -89,21 +87,21 @@ def test_what_is_not_the_same_is_not_finished(scene, tmp_path, change):
         os.utime(out, ns=(record.st_atime_ns, record.st_mtime_ns + 1))
     else:
         out.with_suffix(".fragprune.json").unlink()
-    assert run_json(*words(scene, out, "--iters", 2, *more))["already_finished"] is False
+    assert run_json(*tuning(out, "--iters", 2, *more))["already_finished"] is False
 
 
-def test_another_command_is_refused_while_one_is_unfinished(scene, tmp_path):
+def test_another_command_is_refused_while_one_is_unfinished(tuning, tmp_path):
     out = tmp_path / "out.ply"
-    killed(9, *words(scene, out))
-    other = words(scene, out, "--pressure", 1e-3)
+    killed(9, *tuning(out))
+    other = tuning(out, "--pressure", 1e-3)
     fails(*other, says=("[checkpoint]", "with other goal"), code=1)
     assert run_json(*other, "--again")["resumed_at"] == 0
 
 
-def test_two_at_once_are_refused(scene, tmp_path):
+def test_two_at_once_are_refused(tuning, tmp_path):
     out = tmp_path / "out.ply"
     with locked(out, wait=0, what="run"):
-        refused = run(*words(scene, out))
+        refused = run(*tuning(out))
     assert refused.exit_code == 1
     assert "another process" in refused.stderr
-    assert run(*words(scene, out)).exit_code == 0
+    assert run(*tuning(out)).exit_code == 0

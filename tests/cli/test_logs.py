@@ -9,7 +9,6 @@ from types import SimpleNamespace
 import pytest
 from cli.commands import fails, run, run_json
 from click.shell_completion import ShellComplete
-from finetune import tiny
 
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.plugins.hookspecs import fragprune_step
@@ -23,8 +22,6 @@ from fragprune_plugins.workbench.commands.logs import (
     WandbLog,
     logging_steps,
 )
-
-WORDS = ("--iters", 6, "--train", "opacity")
 
 
 def stats(step):
@@ -55,20 +52,9 @@ def test_the_bar_of_a_run_says_when_it_warms_up(monkeypatch, step, name):
     assert f"fragprune, {name}: " in sys.stderr.getvalue()
 
 
-def test_finetune_writes_a_row_a_step(tmp_path):
-    data, model, _ = tiny.scene(tmp_path)
+def test_finetune_writes_a_row_a_step(words, tmp_path):
     log = tmp_path / "steps.csv"
-    report = run_json(
-        "finetune",
-        model,
-        "--data",
-        data,
-        "--out",
-        tmp_path / "p.ply",
-        *WORDS,
-        "--log",
-        f"csv:{log}",
-    )
+    report = run_json(*words, 6, "--train", "opacity", "--log", f"csv:{log}")
     written = rows(log)
     assert [int(row["step"]) for row in written] == [1, 2, 3, 4, 5, 6]
     assert set(written[0]) == set(COLUMNS)
@@ -124,34 +110,30 @@ def test_wandb_gets_every_step(monkeypatch):
     assert seen[3] == "end"
 
 
-def test_a_missing_library_is_a_usage_error_that_says_what_to_install(tmp_path, monkeypatch):
-    data, model, _ = tiny.scene(tmp_path)
+def test_a_missing_library_is_a_usage_error_that_says_what_to_install(words, out, monkeypatch):
     monkeypatch.setitem(sys.modules, "wandb", None)
-    out = tmp_path / "p.ply"
-    asked = ("finetune", model, "--data", data, "--out", out, *WORDS, "--log", "wandb:x")
-    fails(*asked, says="fragprune-plugins[wandb]")
+    fails(*words, 6, "--log", "wandb:x", says="fragprune-plugins[wandb]")
     assert not out.exists()
 
 
-def test_a_log_that_fails_later_does_not_stop_learning(tmp_path, caplog):
-    data, model, _ = tiny.scene(tmp_path)
+def test_a_log_that_fails_later_does_not_stop_learning(words, caplog):
     with caplog.at_level(logging.WARNING):
-        result = run(
-            *("finetune", model, "--data", data, "--out", tmp_path / "p.ply", *WORDS),
-            *("--log", "csv:/dev/full"),
-        )
+        result = run(*words, 6, "--train", "opacity", "--log", "csv:/dev/full")
     assert result.exit_code == 0
     assert "log-0-CsvLog, fragprune_step: OSError" in caplog.text
 
 
-def test_a_config_file_gives_the_options(tmp_path):
-    data, model, _ = tiny.scene(tmp_path)
-    config = tmp_path / "quick.toml"
-    config.write_text(f"data = '{data}'\niters = 4\ntrain = 'opacity'\nno_truncation = true\n")
-    words = ("finetune", model, "--config", config)
+def test_a_config_file_gives_the_options(data, path, tmp_path):
+    """Also flags, and in a list what is given several times."""
+    log, config = tmp_path / "a.csv", tmp_path / "quick.toml"
+    config.write_text(
+        f"data = '{data}'\niters = 4\ntrain = 'opacity'\nself = true\nlog = ['csv:{log}']\n"
+    )
+    words = ("finetune", path, "--config", config)
     report = run_json(*words, "--out", tmp_path / "a.ply")
-    assert report["iterations"] == 4
+    assert report["iterations"] == len(rows(log)) == 4
     assert report["settings"]["train"] == "opacity"
+    assert report["target"] == "itself"
     other = run_json(*words, "--out", tmp_path / "b.ply", "--iters", 2)  # the line goes before
     assert other["iterations"] == 2
 
@@ -161,12 +143,10 @@ def test_a_shell_completes_commands():
     assert [each.value for each in asked.get_completions([], "fine")] == ["finetune"]
 
 
-def test_a_file_that_is_no_log_is_not_begun_anew(tmp_path):
-    data, model, _ = tiny.scene(tmp_path)
-    before = model.read_bytes()
-    words = ("finetune", model, "--data", data, "--out", tmp_path / "p.ply", *WORDS)
-    fails(*words, "--log", f"csv:{model}", says="a file that is no log", code=1)
-    assert model.read_bytes() == before
+def test_a_file_that_is_no_log_is_not_begun_anew(words, path):
+    before = path.read_bytes()
+    fails(*words, 6, "--log", f"csv:{path}", says="a file that is no log", code=1)
+    assert path.read_bytes() == before
 
 
 VALUES = {
@@ -198,10 +178,3 @@ def test_a_config_file_is_read_as_the_line_is_and_what_is_wrong_is_a_usage_error
     result = run("finetune", __file__, *words, "--config", tmp_path / "a.toml")
     assert result.exit_code == 2
     assert VALUES[text] in " ".join(result.stderr.split())
-
-
-def test_a_list_of_a_config_file_is_an_option_given_several_times(tmp_path):
-    data, model, _ = tiny.scene(tmp_path)
-    (tmp_path / "a.toml").write_text(f"data = '{data}'\niters = 2\nlog = ['csv:{tmp_path}/a.csv']")
-    run_json("finetune", model, "--config", tmp_path / "a.toml", "--out", tmp_path / "a.ply")
-    assert len(rows(tmp_path / "a.csv")) == 2

@@ -2,10 +2,8 @@
 
 import click
 import pytest
-from cli.commands import fails, run, run_json
+from cli.commands import fails, run
 from click.testing import CliRunner
-from finetune import tiny
-from PIL import Image
 
 from fragprune_plugins.plugins.points import load, offered
 from fragprune_plugins.workbench.commands import GROUP, cli
@@ -28,14 +26,6 @@ def test_a_model_that_is_not_there_is_what_is_wrong(name, tmp_path):
     asked = (name, tmp_path / "no.ply", *([tmp_path / "b.ply"] * (name == "compare")), *words)
     fails(*asked, says=("[model-file]", "no.ply: no such file"), code=1)
     assert not out.exists()
-
-
-def test_cameras_of_a_file_are_divided(tmp_path):
-    _, model, _ = tiny.scene(tmp_path)
-    cameras, out = tiny.write_path(tmp_path / "path.json", ["a", "b"]), tmp_path / "pictures"
-    run_json("render", model, "--cameras", cameras, "--out", out, "--resolution", 2)
-    with Image.open(out / "a.png") as picture:
-        assert picture.size == (10, 6)
 
 
 def test_the_list_of_commands_cuts_no_sentence():

@@ -1,7 +1,5 @@
 """A training's output folder in place of a model, and what is known of the training then."""
 
-import json
-from argparse import Namespace
 from dataclasses import replace
 
 import pytest
@@ -15,23 +13,9 @@ from fragprune_plugins.workbench.models.formats.ply import write_ply
 from fragprune_plugins.workbench.scenes.output import newest_model, trained_on
 
 
-def write_output(folder, data, model, **arguments):
-    """What a 3DGS host leaves: models of two iterations, its arguments and its cameras."""
-    for iteration in (900, 10_000):
-        place = folder / "point_cloud" / f"iteration_{iteration}"
-        place.mkdir(parents=True)
-        write_ply(place / "point_cloud.ply", model)
-    known = {"sh_degree": 1, "source_path": str(data), "images": "images", "resolution": -1}
-    known |= {"white_background": False, "eval": True, "data_device": "cuda"} | arguments
-    (folder / "cfg_args").write_text(str(Namespace(**known)))
-    (folder / "cameras.json").write_text(json.dumps(tiny.host_cameras(tiny.cameras()[:1])))
-    return folder
-
-
 @pytest.fixture
-def output(tmp_path):
-    data, _, model = tiny.scene(tmp_path)
-    return write_output(tmp_path / "out", data, model)
+def output(data, model, tmp_path):
+    return tiny.host_output(tmp_path / "out", data, model)
 
 
 def test_profile_takes_the_newest_model_and_the_trainings_photographs(output, tmp_path):
@@ -57,10 +41,9 @@ def test_options_override_the_training(output):
 
 
 @pytest.mark.parametrize("white", [True, False])
-def test_beside_data_the_training_says_whether_it_drew_over_white(tmp_path, white):
-    data, _, model = tiny.scene(tmp_path)
-    known = write_output(tmp_path / "out", data, model, white_background=white)
-    alone = write_output(tmp_path / "alone", data, model)
+def test_beside_data_the_training_says_whether_it_drew_over_white(data, model, tmp_path, white):
+    known = tiny.host_output(tmp_path / "out", data, model, white_background=white)
+    alone = tiny.host_output(tmp_path / "alone", data, model)
     asked = run_json("profile", known, "--data", data)
     told = ("--white-background",) if white else ()
     for figures in (asked, run_json("compare", known, known, "--data", data)["a"]):
@@ -89,28 +72,20 @@ def test_compare_takes_the_trainings_photographs(output):
     assert run_json("compare", *models)["psnr_change"] == 0
 
 
-@pytest.mark.parametrize("command", ["profile", "render", "finetune", "export"])
-def test_a_folder_without_a_model_is_a_usage_error(command, tmp_path):
-    asked = (command, tmp_path, "--out", tmp_path / "x.ply")
-    fails(*asked, says="a folder without point_cloud/iteration_*/point_cloud.ply")
-
-
-def test_a_model_elsewhere_needs_data(tmp_path):
-    _, path, _ = tiny.scene(tmp_path)
-    fails("profile", path, says="no cfg_args")
-
-
-def test_a_training_that_held_nothing_out_is_warned_of(tmp_path, caplog):
-    data, _, model = tiny.scene(tmp_path)
-    output = write_output(tmp_path / "out", data, model, eval=False)
-    assert run("profile", output).exit_code == 0
+@pytest.mark.parametrize("beside", [False, True])
+def test_a_training_that_held_nothing_out_is_warned_of(data, model, tmp_path, caplog, beside):
+    output = tiny.host_output(tmp_path / "out", data, model, eval=False)
+    more = ("--data", data, "--white-background") if beside else ()
+    assert run("profile", output, *more).exit_code == 0
     assert "trained without --eval" in caplog.text
 
 
 @pytest.mark.parametrize("held", [True, False])
-def test_views_that_a_training_saw_are_not_said_to_be_held_out(tmp_path, held):
-    data, _, model = tiny.scene(tmp_path)
-    output, out = write_output(tmp_path / "out", data, model, eval=held), tmp_path / "r/pruned.ply"
+def test_views_that_a_training_saw_are_not_said_to_be_held_out(data, model, tmp_path, held):
+    output, out = (
+        tiny.host_output(tmp_path / "out", data, model, eval=held),
+        tmp_path / "r/pruned.ply",
+    )
     words = ("--data", data, "--out", out, "--iters", 3, "--train", "opacity")
     said = "on 2 views that were held out." if held else "on 2 views that its training had seen."
     assert said in run("finetune", output, *words).stdout
@@ -118,13 +93,6 @@ def test_views_that_a_training_saw_are_not_said_to_be_held_out(tmp_path, held):
     page = (out.parent / "report.html").read_text()
     assert ("nothing learned from it" in page) is held
     assert run_json("finetune", output, *words)["seen"] is not held
-
-
-def test_beside_data_and_a_white_background_it_is_warned_of_too(tmp_path, caplog):
-    data, _, model = tiny.scene(tmp_path)
-    output = write_output(tmp_path / "out", data, model, eval=False)
-    assert run("profile", output, "--data", data, "--white-background").exit_code == 0
-    assert "trained without --eval" in caplog.text
 
 
 SIZES = {
@@ -136,9 +104,8 @@ SIZES = {
 
 
 @pytest.mark.parametrize("asked", SIZES)
-def test_the_size_of_photographs_is_the_hosts(tmp_path, asked):
-    data, _, model = tiny.scene(tmp_path)
-    output = write_output(
+def test_the_size_of_photographs_is_the_hosts(data, model, tmp_path, asked):
+    output = tiny.host_output(
         tmp_path / "out", data, model, resolution=asked, white_background=True, images="images_8"
     )
     model_file = output / "point_cloud" / "iteration_900" / "point_cloud.ply"
@@ -167,8 +134,7 @@ def test_arguments_that_are_none_are_refused_and_not_executed(output, text, caps
     assert "memory" not in stated.value.found
 
 
-def test_models_of_different_things_are_told_apart(tmp_path):
-    data, path, model = tiny.scene(tmp_path)
+def test_models_of_different_things_are_told_apart(data, path, model, tmp_path):
     other = tmp_path / "other.ply"
     write_ply(other, replace(model, f_dc=-3 * model.f_dc, xyz=model.xyz + 0.5))
     (warning,) = run_json("compare", path, other, "--data", data)["warnings"]

@@ -3,31 +3,38 @@
 import json
 
 import pytest
-from cli.commands import fails, run, run_json
+from cli.commands import run, run_json
 from finetune import tiny
 from finetune.several import command
 from PIL import Image
 
 
-def test_held_out_views(cut_scene, tmp_path):
-    data, path = cut_scene
-    out = tmp_path / "pictures"
-    report = run_json("render", path, "--data", data, "--out", out)
-    names = sorted(file.name for file in out.iterdir())
-    assert names == ["view00.png", "view08.png"]
-    assert len(report["files"]) == 2
-    with Image.open(out / "view00.png") as picture:
-        assert picture.size == (tiny.SIDE, tiny.SIDE)
-    plain = run_json("render", path, "--data", data, "--out", out, "--no-truncation")
-    assert plain["truncated"] is False
-    assert report["truncated"] is True
+@pytest.fixture
+def drawn(cut, tmp_path):
+    """Draws the model; what the command says, and the pictures by name."""
+
+    def rendered(*words):
+        report = run_json("render", cut, "--out", tmp_path / "pictures", *words)
+        files = sorted((tmp_path / "pictures").iterdir())
+        assert sorted(report["files"]) == [str(file) for file in files]
+        return report, {file.name: Image.open(file) for file in files}
+
+    return rendered
+
+
+def test_held_out_views(data, drawn):
+    report, pictures = drawn("--data", data)
+    assert list(pictures) == ["view00.png", "view08.png"]
+    assert pictures["view00.png"].size == (tiny.SIDE, tiny.SIDE)
+    plain, _ = drawn("--data", data, "--no-truncation")
+    assert (plain["truncated"], report["truncated"]) == (False, True)
     assert plain["fragments_per_pixel"] > report["fragments_per_pixel"]
+    assert len(drawn("--data", data, "--views", "all")[1]) == 9
 
 
 @pytest.mark.parametrize("size", [2, 3])
-def test_gaussians_divided_among_processes_give_the_same_pictures(cut_scene, tmp_path, size):
-    data, path = cut_scene
-    words = ("render", path, "--data", data, "--out")
+def test_gaussians_divided_among_processes_give_the_same_pictures(data, cut, tmp_path, size):
+    words = ("render", cut, "--data", data, "--out")
     one, many = tmp_path / "one", tmp_path / "many"
     whole = run_json(*words, one)
     first, *others = command(size, *words, many, "--shard-gaussians", "--json")
@@ -40,43 +47,28 @@ def test_gaussians_divided_among_processes_give_the_same_pictures(cut_scene, tmp
         assert report[name] == pytest.approx(whole[name]), name
 
 
-def test_a_film_is_not_drawn_by_several_processes(cut_scene, tmp_path):
-    data, path = cut_scene
+def test_a_film_is_not_drawn_by_several_processes(data, cut, tmp_path):
     film = tmp_path / "film.mp4"
-    ended = command(2, "render", path, "--data", data, "--out", film, "--shard-gaussians")
+    ended = command(2, "render", cut, "--data", data, "--out", film, "--shard-gaussians")
     assert [each.left[0] for each in ended] == [2, 2]
-    asked = ("render", path, "--data", data, "--out", tmp_path / "p", "--shard-gaussians")
-    fails(*asked, says="torchrun")
 
 
-def test_cameras_file_and_views(cut_scene, tmp_path):
-    data, path = cut_scene
-    cameras = tiny.write_path(tmp_path / "path.json", ["a", "b"])
-    out = tmp_path / "pictures"
-    result = run("render", path, "--cameras", cameras, "--out", out)
-    assert result.exit_code == 0
-    assert "Wrote 2 pictures" in result.stdout
-    with Image.open(out / "b.png") as picture:
-        assert picture.size == (20, 12)
-    report = run_json("render", path, "--data", data, "--views", "all", "--out", out)
-    assert len(report["files"]) == 9
-
-
-def test_two_views_of_one_name_are_two_pictures(cut_scene, tmp_path):
-    _, path = cut_scene
+@pytest.mark.parametrize("divide", [1, 2])
+def test_cameras_of_a_file_two_of_which_have_one_name(drawn, tmp_path, divide):
     cameras = tiny.write_path(tmp_path / "path.json", ["train/r_0", "test/r_0"])
-    out = tmp_path / "pictures"
-    report = run_json("render", path, "--cameras", cameras, "--out", out)
-    assert sorted(file.name for file in out.iterdir()) == ["r_0-2.png", "r_0.png"]
-    assert len(set(report["files"])) == 2
+    report, pictures = drawn("--cameras", cameras, "--resolution", divide)
+    sizes = {name: picture.size for name, picture in pictures.items()}
+    assert sizes == dict.fromkeys(["r_0-2.png", "r_0.png"], (20 // divide, 12 // divide))
     assert report["warnings"] == []
 
 
-def test_a_view_that_shows_nothing_is_warned_of(cut_scene, tmp_path):
-    _, path = cut_scene
-    content = tiny.transforms(["a", "b"], tiny.cameras()[:2]) | {"w": 20, "h": 12}
+def test_a_view_that_shows_nothing_is_warned_of(cut, tmp_path):
+    path = tiny.write_path(tmp_path / "path.json", ["a", "b"])
+    content = json.loads(path.read_text())
     content["frames"][1]["transform_matrix"][2][3] = 1e5
-    (tmp_path / "path.json").write_text(json.dumps(content))
-    words = ("render", path, "--cameras", tmp_path / "path.json", "--out", tmp_path / "pictures")
-    assert "Warning: 1 of 2 show no Gaussian" in run(*words).stdout
+    path.write_text(json.dumps(content))
+    words = ("render", cut, "--cameras", path, "--out", tmp_path / "pictures")
+    said = run(*words).stdout
+    assert "Wrote 2 pictures" in said
+    assert "Warning: 1 of 2 show no Gaussian" in said
     assert len(run_json(*words)["warnings"]) == 1

@@ -19,23 +19,32 @@ from fragprune_plugins.workbench.scenes.generated import around, bounds
 
 @pytest.fixture(scope="module")
 def finetuned(tmp_path_factory):
+    """A folder with all that a fine-tuning takes and leaves, and its figures."""
     folder = tmp_path_factory.mktemp("report")
     data, model, _ = tiny.scene(folder)
-    out = folder / "out"
     words = ("--data", data, "--iters", 4, "--train", "opacity")
-    figures = run_json("finetune", model, "--out", out / "pruned.ply", *words)
-    return out, data, figures
+    return folder, run_json("finetune", model, "--out", folder / "out" / "pruned.ply", *words)
 
 
 @pytest.fixture
-def folder(finetuned, tmp_path):
-    out, data, figures = finetuned
-    whole = shutil.copytree(out.parent, tmp_path / "all")  # a record names files beside its folder
-    return whole / "out", whole / data.relative_to(out.parent), figures
+def out(finetuned, tmp_path):
+    """What it left, in a copy of that folder: a record names files beside its own."""
+    return shutil.copytree(finetuned[0], tmp_path / "all") / "out"
 
 
-def test_a_fine_tuning_becomes_a_page_that_stands_alone(folder):
-    out, data, figures = folder
+@pytest.fixture
+def data(out):
+    return out.parent / "data"
+
+
+@pytest.fixture
+def record(out):
+    (record,) = records.find(out)
+    return record
+
+
+def test_a_fine_tuning_becomes_a_page_that_stands_alone(finetuned, out, data):
+    _, figures = finetuned
     report = run_json("report", out, "--data", data)
     page = (out / "report.html").read_text()
     assert report["page"] == str(out / "report.html")
@@ -54,13 +63,12 @@ def test_a_fine_tuning_becomes_a_page_that_stands_alone(folder):
     assert "://" not in page
 
 
-def test_a_fine_tuning_without_photographs_shows_the_original_s_own_views(tmp_path):
-    _, model, _ = tiny.scene(tmp_path)
+def test_a_fine_tuning_without_photographs_shows_the_original_s_own_views(path, tmp_path):
     out = tmp_path / "pruned.ply"
     words = ("--iters", 2, "--train", "opacity", "--resolution", 16)
-    run_json("finetune", model, "--self", "--out", out, *words)
+    run_json("finetune", path, "--self", "--out", out, *words)
     report = run_json("report", tmp_path)
-    splat = load(model)
+    splat = load(path)
     cameras, (centre, _) = dict(around(splat)), bounds(splat)
     below = [float(cameras[name].campos[1] - centre[1]) for name in report["views"]]
     assert len(below) == 3
@@ -68,15 +76,11 @@ def test_a_fine_tuning_without_photographs_shows_the_original_s_own_views(tmp_pa
     page = (tmp_path / "report.html").read_text()
     assert "The original&#39;s own picture" in page
     assert "PSNR of the picture against the original" in page
-    elsewhere = tmp_path / "elsewhere"
-    elsewhere.mkdir()
-    for file in tmp_path.glob("pruned*"):
-        shutil.copy(file, elsewhere)
-    assert run_json("report", elsewhere)["views"] == []  # the original lies outside the folder
+    path.rename(tmp_path.parent / "model.ply")
+    assert run_json("report", tmp_path)["views"] == []  # the original lies outside the folder
 
 
-def test_as_text_the_result_comes_first(folder):
-    out, _, _ = folder
+def test_as_text_the_result_comes_first(out):
     result = run("report", out, "--out", out / "page.html")
     assert result.exit_code == 0
     assert "x fewer fragments" in result.stdout.splitlines()[0]
@@ -88,16 +92,14 @@ def test_as_text_the_result_comes_first(folder):
     ("name", "found", "remedy"),
     [("pruned.ply", "a file", "fragprune view "), ("nowhere", "no such folder", "Check the name")],
 )
-def test_what_is_no_folder_is_refused_with_the_next_command(folder, name, found, remedy):
-    out, _, _ = folder
+def test_what_is_no_folder_is_refused_with_the_next_command(out, name, found, remedy):
     error = run_error("report", out / name, "--json")
     assert (error["where"], error["found"]) == (str(out / name), found)
     assert remedy in error["remedy"]
     assert (f"fragprune report {out};" in error["remedy"]) == (name == "pruned.ply")
 
 
-def test_comparisons_come_along_with_their_pictures(folder):
-    out, data, _ = folder
+def test_comparisons_come_along_with_their_pictures(out, data):
     pruned = out / "pruned.ply"
     run_json("compare", pruned, pruned, "--data", data, "--out", out / "pictures")
     run_json("profile", pruned, "--data", data, "--out", out / "more")
@@ -116,9 +118,7 @@ def test_comparisons_come_along_with_their_pictures(folder):
     assert (alone["command"], alone["views"]) == ("compare", [])
 
 
-def test_without_the_photographs_there_are_curves_and_the_reason(folder, tmp_path):
-    out, data, _ = folder
-    (record,) = records.find(out)
+def test_without_the_photographs_there_are_curves_and_the_reason(out, data, record, tmp_path):
     record.data["photographs"]["folder"] = str(tmp_path / "moved")
     records.leave(out / "pruned", "finetune", record.data)
     result = run("report", out)
@@ -130,24 +130,19 @@ def test_without_the_photographs_there_are_curves_and_the_reason(folder, tmp_pat
     assert run_error("report", out, *elsewhere, "--json")["code"] == "dataset"
 
 
-def test_what_a_fine_tuning_leaves_names_no_folder_of_the_machine(finetuned, tmp_path):
-    out, data, _ = finetuned
-    whole = shutil.copytree(out.parent, tmp_path / "elsewhere")
-    page = whole / "page.html"
-    run_json("report", whole / "out", "--data", whole / "data", "--out", page)
-    run_json("compare", *[whole / "out/pruned.ply"] * 2, "--out", whole / "pictures")
-    for file in (each for each in whole.rglob("*") if each.is_file()):
+def test_what_a_fine_tuning_leaves_names_no_folder_of_the_machine(finetuned, out, data, tmp_path):
+    run_json("report", out, "--data", data, "--out", out.parent / "page.html")
+    run_json("compare", *[out / "pruned.ply"] * 2, "--out", out.parent / "pictures")
+    for file in (each for each in out.parent.rglob("*") if each.is_file()):
         content = file.read_bytes()
-        assert str(data.parent).encode() not in content, file
+        assert str(finetuned[0]).encode() not in content, file
         assert str(tmp_path).encode() not in content, file
 
 
-def test_models_and_photographs_are_found_where_the_whole_tree_was_moved_to(finetuned, tmp_path):
-    out, _, figures = finetuned
-    whole = shutil.copytree(out.parent, tmp_path / "elsewhere")
-    same = run_json("compare", whole / "model.ply", whole / "out/pruned.ply")
-    assert same["scene"]["folder"] == str(whole / "data")
-    assert same["b"]["psnr"] == pytest.approx(figures["after"]["psnr"], rel=1e-6)
+def test_models_and_photographs_are_found_where_the_whole_tree_was_moved_to(finetuned, out, data):
+    same = run_json("compare", out.parent / "model.ply", out / "pruned.ply")
+    assert same["scene"]["folder"] == str(data)
+    assert same["b"]["psnr"] == pytest.approx(finetuned[1]["after"]["psnr"], rel=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -188,9 +183,7 @@ def test_a_record_elsewhere_finds_the_home_folder_of_whoever_reads_it(tmp_path, 
     assert records.located("~/scene", tmp_path / "out") == tmp_path / "home/al/scene"
 
 
-def test_a_loss_that_is_not_known_leaves_a_gap_in_the_curves(folder, tmp_path):
-    out, _, _ = folder
-    (record,) = records.find(out)
+def test_a_loss_that_is_not_known_leaves_a_gap_in_the_curves(out, record, tmp_path):
     curves = record.data["curves"]
     curves[1]["loss"] = None  # of a step that was skipped
     report_page.save_learning(tmp_path / "curves.png", curves, torch.full((60,), 0.1))
@@ -216,8 +209,7 @@ def test_a_run_that_was_not_measured_reports_its_training_views(tmp_path, goal, 
     assert re.search(r"fragments per pixel.*30\.00.*12\.00", page, re.DOTALL)
 
 
-def test_a_folder_of_controls_alone_is_named_as_one(folder, tmp_path):
-    out, data, _ = folder
+def test_a_folder_of_controls_alone_is_named_as_one(out, data, tmp_path):
     zero = tmp_path / "zero"
     words = ("--out", zero / "zero.ply", "--data", data, "--iters", 2, "--control")
     run_json("finetune", out / "pruned.ply", *words)
@@ -229,14 +221,6 @@ def test_a_folder_of_controls_alone_is_named_as_one(folder, tmp_path):
     assert report["control"] is True
     assert report["pictures"] == 7 * len(report["views"]) + 1  # what it learned, too
     assert run_json("report", out)["control"] is False
-
-
-@pytest.mark.parametrize("text", ["{", "[]", '{"format": "another"}'])
-def test_a_record_that_is_none_is_refused(tmp_path, text):
-    (tmp_path / "a.fragprune.json").write_text(text)
-    result = run("report", tmp_path)
-    assert result.exit_code == 1
-    assert result.stderr.startswith("[record] ")
 
 
 def test_a_folder_without_records_says_what_to_run(tmp_path):
@@ -251,9 +235,7 @@ def test_figures_that_are_not_numbers_are_null(tmp_path):
     assert json.loads(path.read_text())["data"] == {"loss": None}
 
 
-def test_without_being_asked_nothing_outside_of_the_folder_is_read(folder, tmp_path):
-    out, _, _ = folder
-    (record,) = records.find(out)
+def test_without_being_asked_nothing_outside_of_the_folder_is_read(out, record, tmp_path):
     secret = tmp_path / "secret.png"
     tiny.save_png(secret, torch.rand(3, 8, 8))
     (out / "linked.png").symlink_to(secret)
@@ -278,22 +260,19 @@ def test_without_being_asked_nothing_outside_of_the_folder_is_read(folder, tmp_p
 
 
 @pytest.mark.parametrize(
-    "changed",
+    "content",
     [
-        {"before": 3},
-        {"after": {"psnr": "high"}},
-        {"settings": []},
-        {"files": 7},
-        {"curves": [{"step": "a"}]},
-        {"photographs": []},
+        *("{", "[]", '{"format": "another"}'),
+        *({"before": 3}, {"after": {"psnr": "high"}}, {"settings": []}, {"files": 7}),
+        *({"curves": [{"step": "a"}]}, {"iterations": {}, "adapter": "x"}, {"photographs": []}),
         {"photographs": {"models": ["a"], "drawing": {}, "filtered": False}},
-        {"iterations": {}, "adapter": "x"},
     ],
 )
-def test_a_record_of_other_types_is_refused(folder, changed):
-    out, _, _ = folder
-    (record,) = records.find(out)
-    records.leave(out / "pruned", "finetune", record.data | changed)
+def test_a_record_that_is_none_or_of_other_types_is_refused(out, record, content):
+    changed = content if isinstance(content, dict) else {}
+    path = records.leave(out / "pruned", "finetune", record.data | changed)
+    if not changed:
+        path.write_text(content)
     result = run("report", out)
     assert result.exit_code == 1
-    assert result.stderr.startswith(f"[record] {out / 'pruned.fragprune.json'}: ")
+    assert result.stderr.startswith(f"[record] {path}: ")

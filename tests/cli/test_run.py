@@ -6,7 +6,7 @@ import shutil
 
 import pytest
 import torch
-from cli.commands import run, run_error, run_json
+from cli.commands import fails, run, run_error, run_json
 from finetune import tiny
 from miniatures.runs import TINY
 from miniatures.vanilla_3dgs import HOST
@@ -49,8 +49,9 @@ def trained(scene, tmp_path_factory):
 
 @pytest.fixture
 def folder(trained, tmp_path):
-    out, _, scene = trained
-    return shutil.copytree(out, tmp_path / "out"), scene
+    """Such a run, and the words of the host's command."""
+    out = shutil.copytree(trained[0], tmp_path / "out")
+    return out, command(trained[2], out, "-r", 2)
 
 
 def test_the_line_has_frame_times_and_says_that_no_control_was_run(scene, tmp_path, caplog):
@@ -58,6 +59,8 @@ def test_the_line_has_frame_times_and_says_that_no_control_was_run(scene, tmp_pa
     result = run("run", *WORDS, *command(scene, tmp_path / "out"))
     assert caplog.text.count("nothing is proved") == 1  # not once in each stage
     assert result.exit_code == 0, result.stderr
+    assert f"fragprune view {models(tmp_path / 'out')[1]}" in result.stdout
+    assert f"fragprune report {tmp_path / 'out'}" in result.stdout
     (line,) = (line for line in result.stdout.splitlines() if "x fewer fragments" in line)
     assert " ms (" in line
     assert "no control was run; to see, add --stage finetune --control" in line
@@ -69,19 +72,13 @@ def test_a_host_trains_with_the_usual_stop_and_its_model_keeps_it(trained):
     assert load(found["model_after"]).stop == USUAL_STOP
 
 
-def test_the_host_and_the_engine_take_as_many_threads_as_they_are_given(
-    scene, tmp_path, monkeypatch
-):
-    threads = []
-
+@pytest.mark.parametrize(("words", "threads"), [([], 1), (["--threads", 3], 3)])
+def test_the_host_takes_as_many_threads_as_it_is_given(words, threads, monkeypatch):
     def launched(*_):
-        threads.append(torch.get_num_threads())
-        raise UsageError("host", "a stand-in", "no more than its threads", "Nothing.")
+        raise UsageError("host", f"{torch.get_num_threads()} threads", "a look", "Nothing.")
 
     monkeypatch.setattr(launch, "run", launched)
-    for words in ([], ["--threads", 3]):
-        assert run("run", *words, *command(scene, tmp_path / "out")).exit_code == 2
-    assert threads == [1, 3]
+    fails("run", *words, "--", HOST / "train.py", says=f"{threads} threads")
 
 
 @pytest.mark.parametrize(
@@ -92,33 +89,12 @@ def test_the_host_and_the_engine_take_as_many_threads_as_they_are_given(
         ("chkpnt16.pth", (), False),  # RT-4DGS
     ],
 )
-def test_a_page_is_advised_only_of_a_model_that_view_shows(
-    name, beside, shown, trained, tmp_path, monkeypatch
-):
-    _, found, _ = trained
+def test_a_page_is_advised_only_of_a_model_that_view_shows(name, beside, shown, trained, tmp_path):
     model = tmp_path / name
-    shutil.copy(found["model_before"], model)
+    shutil.copy(trained[1]["model_before"], model)
     for each in beside:
         (tmp_path / each).touch()
-    summary = launch.RunSummary(
-        adapter="a host",
-        engine="cpu",
-        device="cpu",
-        stage="finetune",
-        steps=6,
-        gaussians=found["gaussians"],
-        fragments_before=2.0,
-        fragments_after=1.0,
-        model_after=model,
-        train_seconds=1.0,
-        curves=[],
-        settings=found["settings"],
-        output=tmp_path,
-    )
-    monkeypatch.setattr(launch, "run", lambda *_: summary)
-    said = run("run", "--", HOST / "train.py").stdout
-    assert (f"fragprune view {model}" in said) == shown
-    assert f"fragprune report {tmp_path}" in said
+    assert work._viewable(model) == shown
 
 
 @pytest.mark.parametrize(
@@ -139,9 +115,8 @@ def test_a_control_inside_one_training_lies_beside_the_result_too(scene, tmp_pat
 
 
 def test_the_table_of_a_control_calls_nothing_pruned(folder):
-    out, scene = folder
-    words = ["--stage", "finetune", *WORDS, "--control", *command(scene, out, "-r", 2)]
-    result = run("run", *words)
+    out, words = folder
+    result = run("run", "--stage", "finetune", *WORDS, "--control", *words)
     assert result.exit_code == 0, result.stderr
     assert result.stdout.split("\n")[0].split() == ["original", "control", "change"]
     run("report", out / "control")
@@ -151,18 +126,16 @@ def test_the_table_of_a_control_calls_nothing_pruned(folder):
 
 
 def test_compare_is_advised_of_nothing_that_was_not_measured(folder):
-    out, scene = folder
+    out, words = folder
     (record,) = records.find(out)
     records.leave(models(out)[1], "run", record.data | {"before": None})
-    result = run("run", "--stage", "finetune", *WORDS, *command(scene, out, "-r", 2))
+    result = run("run", "--stage", "finetune", *WORDS, *words)
     assert "is finished" in result.stdout
     assert "fragprune compare" not in result.stdout
 
 
 def test_a_control_lies_beside_the_result_and_is_quoted_with_it(folder):
-    out, scene = folder
-    finetune = ["--stage", "finetune", *WORDS]
-    words = command(scene, out, "-r", 2)
+    (out, words), finetune = folder, ["--stage", "finetune", *WORDS]
     kept = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
     zero = ran(*finetune, "--control", *words)
     assert zero["model_after"].startswith(str(out / "control"))
@@ -185,8 +158,7 @@ def test_views_that_stage_one_saw_are_not_said_to_be_held_out(scene, tmp_path, h
 
 
 def test_a_finished_stage_two_says_so_and_runs_nothing(folder):
-    out, scene = folder
-    finetune, words = ["--stage", "finetune", *WORDS], command(scene, out, "-r", 2)
+    (out, words), finetune = folder, ["--stage", "finetune", *WORDS]
     result = models(out)[1]
     written = result.stat().st_mtime_ns
     report = ran(*finetune, *words)
@@ -226,9 +198,12 @@ FULL = torch.cuda.OutOfMemoryError(
 
 
 @pytest.mark.parametrize(
-    "error", [ModelFileError("out", "a stand-in", "another", "Nothing."), FULL]
+    ("where", "error"),
+    [
+        ((trial, "forgotten"), FULL),
+        ((work, "kept"), ModelFileError("out", "a stand-in", "another", "Nothing.")),
+    ],
 )
-@pytest.mark.parametrize("where", [(trial, "forgotten"), (work, "kept")])
 def test_where_a_look_fails_stage_two_learns_as_asked(
     scene, tmp_path, monkeypatch, caplog, where, error
 ):
@@ -257,14 +232,6 @@ def test_where_a_gpu_has_no_room_to_measure_the_rest_is_reported(scene, tmp_path
     assert records.find(tmp_path / "out")
 
 
-@pytest.mark.parametrize(("size", "read"), [("16", (16, 12)), ("-1", (40, 30))])
-def test_before_and_after_are_measured_at_the_hosts_resolution(scene, tmp_path, size, read):
-    out = tmp_path / "out"
-    ran(*WORDS, *command(scene, out, "-r", size))
-    text = run("compare", *models(out)).stdout
-    assert f", {read[0]}x{read[1]} pixels" in text
-
-
 def models(out):
     return [out / f"point_cloud/iteration_{i}/point_cloud.ply" for i in (10, 17)]
 
@@ -278,8 +245,8 @@ def test_compare_follows_the_run_that_left_the_models(trained):
             assert same[side][name] == pytest.approx(measured[name], rel=1e-6)
     named = run_json("compare", *models(out), "--data", scene)
     assert named["a"]["psnr"] == same["a"]["psnr"]
-    whole = run_json("compare", *models(out), "--resolution", 1)
-    assert whole["a"]["psnr"] != pytest.approx(same["a"]["psnr"], rel=1e-6)
+    assert ", 20x15 pixels" in run("compare", *models(out)).stdout
+    assert ", 40x30 pixels" in run("compare", *models(out), "--resolution", 1).stdout
 
 
 def test_what_cannot_be_compared_says_why(scene, tmp_path):

@@ -22,3 +22,9 @@ def dataset(truth, tmp_path_factory):
 @pytest.fixture(scope="session")
 def images(truth):
     return tiny.photographs(truth)
+
+
+@pytest.fixture
+def colmap(tmp_path, images):
+    """COLMAP's folder of those pictures."""
+    return tiny.write_colmap(tmp_path, images)

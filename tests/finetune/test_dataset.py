@@ -1,6 +1,5 @@
 """Readers of photographs and cameras: COLMAP text and binary, Blender, cameras.json."""
 
-import json
 import os
 from pathlib import Path
 
@@ -12,6 +11,8 @@ from PIL import Image
 
 from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.workbench.scenes.dataset import load_dataset
+
+SPARSE = Path("sparse/0")
 
 
 def check(dataset, images):
@@ -30,9 +31,8 @@ def check(dataset, images):
 
 
 @pytest.mark.parametrize("binary", [False, True])
-@pytest.mark.parametrize("model", ["PINHOLE", "SIMPLE_PINHOLE"])
-def test_colmap(tmp_path, images, binary, model):
-    check(load_dataset(tiny.write_colmap(tmp_path, images, binary=binary, model=model)), images)
+def test_colmap(tmp_path, images, binary):
+    check(load_dataset(tiny.write_colmap(tmp_path, images, binary=binary)), images)
 
 
 def test_blender(tmp_path, images):
@@ -49,78 +49,65 @@ def test_alpha_is_composited_over_the_background(tmp_path, images):
         assert torch.equal(shot.view.background, torch.full((3,), float(white)))
 
 
-def test_resolution_scales_images_and_intrinsics(tmp_path, images):
-    tiny.write_colmap(tmp_path, images)
-    full, half = load_dataset(tmp_path), load_dataset(tmp_path, resolution=2)
+def test_resolution_scales_images_and_intrinsics(colmap):
+    full, half = load_dataset(colmap), load_dataset(colmap, resolution=2)
     assert half.train[0].image.shape == (3, 16, 16)
     torch.testing.assert_close(half.train[0].view.projmatrix, full.train[0].view.projmatrix)
 
 
-def test_images_smaller_than_their_camera_of_the_same_aspect(tmp_path, images):
-    tiny.write_colmap(tmp_path, images)
-    path = tmp_path / "images" / "view01.png"
-    with Image.open(path) as picture:
-        picture.resize((16, 16)).save(path)
-    shot = load_dataset(tmp_path).train[0]
+def test_images_smaller_than_their_camera_of_the_same_aspect(colmap):
+    path = colmap / "images" / "view01.png"
+    Image.open(path).resize((16, 16)).save(path)
+    shot = load_dataset(colmap).train[0]
     assert (shot.view.width, shot.view.height) == (16, 16)
     assert shot.view.tan_fov_x == pytest.approx(tiny.SIDE / (2 * tiny.FOCAL))
 
 
-def test_off_centre_principal_point(tmp_path, images):
-    tiny.write_colmap(tmp_path, images)
+def test_off_centre_principal_point(colmap):
     line = f"7 PINHOLE {tiny.SIDE} {tiny.SIDE} 36 36 20 16\n"
-    (tmp_path / "sparse" / "0" / "cameras.txt").write_text(line)
-    view = load_dataset(tmp_path).train[0].view
+    (colmap / SPARSE / "cameras.txt").write_text(line)
+    view = load_dataset(colmap).train[0].view
     point = torch.cat([view.campos + view.viewmatrix[:3, 2] * 2, torch.ones(1)])  # straight ahead
     clip = point @ view.projmatrix
     assert float(clip[0] / clip[3] + 1) * tiny.SIDE / 2 == pytest.approx(20, abs=1e-4)
 
 
-def test_extent_is_the_hosts(tmp_path, images):
-    dataset = load_dataset(tiny.write_colmap(tmp_path, images))
+def test_extent_is_the_hosts(colmap):
+    dataset = load_dataset(colmap)
     centres = torch.stack([shot.view.campos for shot in dataset.train])
     farthest = max((c - centres.mean(0)).norm() for c in centres)
     assert dataset.extent == pytest.approx(1.1 * float(farthest))
 
 
-VIEW, SPARSE, TEST = Path("images/view03.png"), Path("sparse/0"), Path("transforms_test.json")
-
-
-def without_frames(folder):
-    (folder / TEST).write_text("{}")
-
-
-def of_a_lens(folder):
-    content = json.loads((folder / TEST).read_text())
-    (folder / TEST).write_text(json.dumps(content | {"camera_model": "EQUIRECTANGULAR"}))
-
-
-def of_one_image(folder):
-    path = folder / SPARSE / "images.txt"
-    path.write_text("\n".join(path.read_text().splitlines()[:3]) + "\n")
-
-
-BLENDER = {
-    "no test file": (lambda f: (f / TEST).unlink(), "transforms_test.json: no such file"),
-    "no frames": (without_frames, "not a transforms file"),
-    "not json": (lambda f: (f / TEST).write_text("{"), "not readable as JSON"),
-    "unknown lens": (of_a_lens, r"/view\d+\S*: camera_model 'EQUIRECTANGULAR'"),
-}
-COLMAP = {
-    "image missing": (lambda f: (f / VIEW).unlink(), "view03.png: no such image"),
-    "image broken": (lambda f: (f / VIEW).write_bytes(b"none"), "view03.png: not readable"),
-    "image size": (lambda f: Image.new("RGB", (32, 24)).save(f / VIEW), "32x24 pixels.*32x32"),
-    "no cameras": (lambda f: (f / SPARSE / "cameras.txt").unlink(), "cameras.txt: no such file"),
-    "one view": (of_one_image, "no training view"),
-}
+VIEW, TEST = Path("images/view03.png"), Path("transforms_test.json")
+CAMERAS, IMAGES = SPARSE / "cameras.txt", SPARSE / "images.txt"
+LENS = '{"camera_model": "EQUIRECTANGULAR", '
 
 
 @pytest.mark.parametrize(
     ("write", "break_it", "words"),
     [
-        pytest.param(write, *how, id=name)
-        for write, wrong in ((tiny.write_blender, BLENDER), (tiny.write_colmap, COLMAP))
-        for name, how in wrong.items()
+        (tiny.write_blender, lambda f: (f / TEST).unlink(), f"{TEST}: no such file"),
+        (tiny.write_blender, lambda f: (f / TEST).write_text("{}"), "not a transforms file"),
+        (tiny.write_blender, lambda f: (f / TEST).write_text("{"), "not readable as JSON"),
+        (
+            tiny.write_blender,
+            lambda f: (f / TEST).write_text(LENS + (f / TEST).read_text()[1:]),
+            r"/view\d+\S*: camera_model 'EQUIRECTANGULAR'",
+        ),
+        (tiny.write_colmap, lambda f: (f / VIEW).unlink(), "view03.png: no such image"),
+        (tiny.write_colmap, lambda f: (f / VIEW).write_bytes(b""), "view03.png: not readable"),
+        (
+            tiny.write_colmap,
+            lambda f: Image.new("RGB", (32, 24)).save(f / VIEW),
+            "32x24 pixels.*32x32",
+        ),
+        (tiny.write_colmap, lambda f: (f / CAMERAS).unlink(), "cameras.txt: no such file"),
+        (
+            tiny.write_colmap,
+            lambda f: (f / IMAGES).write_text("1 1 0 0 0 0 0 0 7 view00.png\n\n"),
+            "no training view",
+        ),
     ],
 )
 def test_bad_scenes_are_refused_by_name(tmp_path, images, write, break_it, words):
@@ -135,14 +122,16 @@ def test_what_is_no_scene_or_two_is_refused_by_name(tmp_path, images):
         load_dataset(tmp_path / "none")
     with pytest.raises(DatasetError, match="neither layout"):
         load_dataset(tmp_path)
-    for binary in (False, True):
-        tiny.write_colmap(tmp_path / str(binary), images, binary=binary, model="FOV")
-        with pytest.raises(DatasetError, match=r"model FOV.*image_undistorter"):
-            load_dataset(tmp_path / str(binary))
-    tiny.write_colmap(tmp_path / "both", images)
-    tiny.write_blender(tmp_path / "both", images)
+    tiny.write_colmap(tmp_path, images)
+    tiny.write_blender(tmp_path, images)
     with pytest.raises(DatasetError, match="both COLMAP's and a transforms layout"):
-        load_dataset(tmp_path / "both")
+        load_dataset(tmp_path)
+    for each in tmp_path.glob("transforms*"):
+        each.unlink()
+    lens = (tmp_path / CAMERAS).read_text().strip().replace("PINHOLE", "FOV")
+    (tmp_path / CAMERAS).write_text(f"{lens} 0.9\n")
+    with pytest.raises(DatasetError, match=r"model FOV.*image_undistorter"):
+        load_dataset(tmp_path)
 
 
 def shared_data() -> Path | None:

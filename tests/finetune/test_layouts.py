@@ -66,11 +66,10 @@ def test_nerfstudio_s_own_choice_of_held_out_views_is_warned_of(tmp_path, images
     assert ("train with --eval-mode interval" in caplog.text) is not named
 
 
-def test_a_smaller_image_folder_serves_and_is_named(tmp_path, images, caplog):
-    tiny.write_colmap(tmp_path, images)
-    (tmp_path / "images").rename(tmp_path / "images_4")
+def test_a_smaller_image_folder_serves_and_is_named(colmap, caplog):
+    (colmap / "images").rename(colmap / "images_4")
     with caplog.at_level(logging.WARNING):
-        load_dataset(tmp_path)
+        load_dataset(colmap)
     assert "reading the photographs of images_4/" in caplog.text
 
 
@@ -88,29 +87,20 @@ def test_the_image_folder_can_be_chosen(tmp_path, images, write):
 
 
 @pytest.mark.parametrize("suffix", [".JPG", ".jpeg", ".PNG", ".webp"])
-def test_images_under_another_suffix_are_found(tmp_path, images, suffix):
-    tiny.write_colmap(tmp_path, images)
-    for path in list((tmp_path / "images").iterdir()):
-        with Image.open(path) as picture:
-            picture.save(path.with_suffix(suffix))
-        if path.with_suffix(suffix).name.lower() != path.name:
-            path.unlink()
-        elif suffix != ".png":
-            path.unlink(missing_ok=True)
-    shot = load_dataset(tmp_path).train[0]
+def test_images_under_another_suffix_are_found(colmap, suffix):
+    for path in list((colmap / "images").iterdir()):
+        path.rename(path.with_suffix(suffix))
+    shot = load_dataset(colmap).train[0]
     assert shot.path.suffix == suffix
     assert shot.image.shape == (3, tiny.SIDE, tiny.SIDE)
 
 
-def test_two_images_of_one_stem_are_not_guessed_between(tmp_path, images):
-    tiny.write_colmap(tmp_path, images)
-    path = tmp_path / "images" / "view03.png"
-    with Image.open(path) as picture:
-        picture.save(path.with_suffix(".jpg"))
-        picture.save(path.with_suffix(".webp"))
-    path.unlink()
+def test_two_images_of_one_stem_are_not_guessed_between(colmap):
+    path = colmap / "images" / "view03.png"
+    path.with_suffix(".jpg").write_bytes(path.read_bytes())
+    path.rename(path.with_suffix(".webp"))
     with pytest.raises(DatasetError, match=r"view03\.png: no such image"):
-        load_dataset(tmp_path)
+        load_dataset(colmap)
 
 
 def test_the_right_folder_is_named_where_another_was_given(tmp_path, images):
@@ -134,10 +124,9 @@ def mask_half(path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["view01.png.png", "view01.png"])
-def test_colmaps_masks_hide_a_part_of_the_photograph(tmp_path, images, name):
-    tiny.write_colmap(tmp_path, images)
-    mask_half(tmp_path / "masks" / name)
-    shot, other = load_dataset(tmp_path).train[:2]
+def test_colmaps_masks_hide_a_part_of_the_photograph(colmap, images, name):
+    mask_half(colmap / "masks" / name)
+    shot, other = load_dataset(colmap).train[:2]
     half = tiny.SIDE // 2
     assert float(shot.image[..., :half].abs().max()) == 0
     torch.testing.assert_close(shot.image[..., half:], images[1][..., half:], atol=0.002, rtol=0)
@@ -162,8 +151,7 @@ def test_what_a_mask_hides_neither_teaches_nor_counts(tmp_path, images):
     assert float((drawn.grad * (1 - hidden)).abs().max()) > 0
     with_mask = measure(tiny.random_model(), data, repeats=1)["psnr"]
     for path in (tmp_path / "images").iterdir():  # what the mask hides changes
-        with Image.open(path) as picture:
-            pixels = np.array(picture)
+        pixels = np.array(Image.open(path))
         pixels[:, : tiny.SIDE // 2] = 255
         Image.fromarray(pixels).save(path)
     again = measure(tiny.random_model(), load_dataset(tmp_path), repeats=1)
@@ -235,23 +223,21 @@ def test_a_file_may_say_which_views_train_and_leave_the_rest_to_us(tmp_path, ima
     assert stems(data.train) == NAMES[1:5]
 
 
-def test_a_mask_that_hides_everything_is_refused(tmp_path, images):
+def test_a_mask_that_hides_everything_is_refused(colmap):
     """Its PSNR would be infinite, and so the mean over all views."""
-    tiny.write_colmap(tmp_path, images)
-    (tmp_path / "masks").mkdir()
+    (colmap / "masks").mkdir()
     black = Image.new("L", (tiny.SIDE, tiny.SIDE))
-    black.save(tmp_path / "masks" / "view08.png")
-    data = load_dataset(tmp_path)
+    black.save(colmap / "masks" / "view08.png")
+    data = load_dataset(colmap)
     with pytest.raises(DatasetError, match="black everywhere"):
         measure(tiny.random_model(), data, repeats=1)
 
 
-def test_a_mask_of_another_aspect_is_refused(tmp_path, images):
-    tiny.write_colmap(tmp_path, images)
-    path = tmp_path / "masks" / "view03.png"
+def test_a_mask_of_another_aspect_is_refused(colmap):
+    path = colmap / "masks" / "view03.png"
     path.parent.mkdir()
     Image.new("L", (tiny.SIDE, 2 * tiny.SIDE), 255).save(path)
-    shot = next(each for each in load_dataset(tmp_path).train if "view03" in each.name)
+    shot = next(each for each in load_dataset(colmap).train if "view03" in each.name)
     with pytest.raises(DatasetError, match=r"view03\.png: 32x64 pixels"):
         _ = shot.image
 
@@ -264,13 +250,12 @@ DEEP = {
 
 
 @pytest.mark.parametrize("kind", DEEP)
-def test_a_photograph_that_would_be_cut_to_8_bits_is_refused(tmp_path, images, kind):
+def test_a_photograph_that_would_be_cut_to_8_bits_is_refused(colmap, kind):
     """Pillow makes it white: a model would learn that without a word."""
-    tiny.write_colmap(tmp_path, images)
     form, pixels = DEEP[kind]
-    Image.fromarray(pixels).save(tmp_path / "images" / "view03.png", format=form)
+    Image.fromarray(pixels).save(colmap / "images" / "view03.png", format=form)
     with pytest.raises(DatasetError, match=r"view03\.png: pixels of mode .*8 bits a channel"):
-        load_dataset(tmp_path)
+        load_dataset(colmap)
 
 
 @pytest.mark.parametrize(

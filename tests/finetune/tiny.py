@@ -3,6 +3,7 @@
 import json
 import math
 import struct
+from argparse import Namespace
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from itertools import count as counting
@@ -108,19 +109,11 @@ def quaternion(rotation: torch.Tensor) -> list[float]:
     return [math.cos(angle / 2), 0.0, math.sin(angle / 2), 0.0]
 
 
-def write_colmap(
-    folder: Path, images: list[torch.Tensor], *, binary: bool = False, model: str = "PINHOLE"
-) -> Path:
-    """images/ and sparse/0 in COLMAP's own format."""
+def write_colmap(folder: Path, images: list[torch.Tensor], *, binary: bool = False) -> Path:
+    """images/ and sparse/0 in COLMAP's own format, with a camera of its model PINHOLE."""
     sparse = folder / "sparse" / "0"
     sparse.mkdir(parents=True)
-    half = SIDE / 2
-    parameters = {
-        "PINHOLE": [FOCAL, FOCAL, half, half],
-        "SIMPLE_PINHOLE": [FOCAL, half, half],
-        "FOV": [FOCAL, FOCAL, half, half, 0.9],
-    }[model]
-    code = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "FOV": 7}[model]
+    parameters = [FOCAL, FOCAL, SIDE / 2, SIDE / 2]
     poses = [
         (f"view{i:02d}.png", quaternion(camera.rotation), camera.translation.tolist())
         for i, camera in enumerate(cameras())
@@ -130,8 +123,7 @@ def write_colmap(
     poses.reverse()  # readers must sort
     if binary:
         with open(sparse / "cameras.bin", "wb") as file:
-            file.write(struct.pack("<QiiQQ", 1, 7, code, SIDE, SIDE))
-            file.write(struct.pack(f"<{len(parameters)}d", *parameters))
+            file.write(struct.pack("<QiiQQ4d", 1, 7, 1, SIDE, SIDE, *parameters))
         with open(sparse / "images.bin", "wb") as file:
             file.write(struct.pack("<Q", len(poses)))
             for i, (name, q, t) in enumerate(poses):
@@ -141,7 +133,7 @@ def write_colmap(
                     file.write(struct.pack("<ddq", 1.0, 2.0, -1))
     else:
         numbers = " ".join(repr(p) for p in parameters)
-        (sparse / "cameras.txt").write_text(f"# cameras\n7 {model} {SIDE} {SIDE} {numbers}\n")
+        (sparse / "cameras.txt").write_text(f"# cameras\n7 PINHOLE {SIDE} {SIDE} {numbers}\n")
         lines = ["# images"]
         for i, (name, q, t) in enumerate(poses):
             lines.append(" ".join(map(str, [i + 1, *q, *t, 7, name])))
@@ -242,3 +234,16 @@ def exact_clock(patch: pytest.MonkeyPatch, base: float = 0.02) -> None:
 
     patch.setattr(evaluate, "timed", timed)
     patch.setattr(faster, "_SECONDS", 0.0)
+
+
+def host_output(folder: Path, data: Path, model: Model, **arguments: object) -> Path:
+    """What a 3DGS host leaves: models of two iterations, its arguments and its first camera."""
+    for iteration in (900, 10_000):
+        place = folder / "point_cloud" / f"iteration_{iteration}"
+        place.mkdir(parents=True)
+        write_ply(place / "point_cloud.ply", model)
+    known = {"sh_degree": 1, "source_path": str(data), "images": "images", "resolution": -1}
+    known |= {"white_background": False, "eval": True, "data_device": "cuda"} | arguments
+    (folder / "cfg_args").write_text(str(Namespace(**known)))
+    (folder / "cameras.json").write_text(json.dumps(host_cameras(cameras()[:1])))
+    return folder
