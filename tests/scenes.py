@@ -15,6 +15,7 @@ from fragprune_plugins.constants import NEUTRAL_LOGIT, TILE
 from fragprune_plugins.engines.reference import ReferenceEngine, camera_of, gaussians_of, options_of
 from fragprune_plugins.types import Compensation, Footprints, RasterInputs, Rim, Splats, View
 from reference_renderer import project
+from reference_renderer.covariance import rotation_matrices
 
 AnySplats = Splats | Footprints
 
@@ -256,15 +257,7 @@ def with_cov3d(splats: Splats) -> Splats:
     """The same Gaussians given by 3D covariances instead of scales and rotations."""
     if splats.scales is None or splats.rotations is None:
         return splats
-    w, x, y, z = splats.rotations.unbind(-1)
-    rotation = torch.stack(
-        [
-            torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-            torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-            torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-        ],
-        dim=-2,
-    )
+    rotation = rotation_matrices(splats.rotations)
     half = rotation * splats.scales[:, None, :]
     full = half @ half.mT
     i, j = torch.triu_indices(3, 3)

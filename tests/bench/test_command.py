@@ -1,6 +1,5 @@
 """``fragprune bench``: its JSON shape, its options, a model of one's own."""
 
-import json
 from pathlib import Path
 
 import pytest
@@ -55,19 +54,13 @@ def test_the_text_says_what_was_saved_and_how_busy_the_machine_was() -> None:
     assert "round 2 of 2" in said.stderr
 
 
-def cameras_file(folder: Path) -> Path:
-    file = folder / "cameras.json"
-    file.write_text(json.dumps(tiny.host_cameras(tiny.cameras()[:1])))
-    return file
-
-
 @pytest.mark.parametrize("learned", [False, True])
 def test_a_model_of_ones_own_with_its_thresholds(tmp_path: Path, learned: bool) -> None:
     model = tmp_path / "mine.ply"
     splat = tiny.random_model()
     write_ply(model, tiny.cut(splat, 0.5) if learned else splat)
-    arguments = (model, "--cameras", cameras_file(tmp_path), "--size", "32x32")
-    rows = run_json("bench", *arguments)["results"]
+    cameras = tiny.write_path(tmp_path / "cameras.json", ["a"])
+    rows = run_json("bench", model, "--cameras", cameras, "--size", "32x32")["results"]
     assert [(row["scene"], row["gaussians"]) for row in rows] == [("mine", 60)] * 4
     plain, cut = (row["fragments_per_pixel"] for row in rows if row["pass"] == "forward")
     assert plain > cut > 0

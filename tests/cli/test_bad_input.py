@@ -172,7 +172,6 @@ OUT_OF_RANGE = {
             (f"{command} . --out o.ply", "a folder without point_cloud/iteration_*/point_cloud.ply")
             for command in ("profile", "render", "finetune", "export")
         ),
-        ("profile FILE", "no cfg_args"),
         ("render FILE --orbit --out o.gif", "o.gif"),
         ("render FILE --out o --data x --shard-gaussians", "torchrun"),
         ("render FILE --out o --data x --cameras y", "--cameras with --data"),

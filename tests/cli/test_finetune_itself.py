@@ -29,7 +29,8 @@ def finetuned(path, out, *more):
 def test_no_photograph_is_opened(data, path, out):
     for image in data.rglob("*.png"):
         image.unlink()
-    report = finetuned(path, out, "--data", data, "--pressure", 1e-3)
+    report = finetuned(path, out, "--data", data, "--pressure", 1e-3, "--keep", 0.9)
+    assert (report["before"]["gaussians"], report["after"]["gaussians"]) == (60, 54)
     assert report["target"] == report["after"]["target"] == "itself"
     assert report["after"]["views"] == 2  # the folder's held-out cameras
     assert report["before"]["psnr"] is None  # infinite

@@ -72,6 +72,10 @@ def test_compare_takes_the_trainings_photographs(output):
     assert run_json("compare", *models)["psnr_change"] == 0
 
 
+def test_a_model_elsewhere_needs_data(path):
+    fails("profile", path, says="no cfg_args")
+
+
 @pytest.mark.parametrize("beside", [False, True])
 def test_a_training_that_held_nothing_out_is_warned_of(data, model, tmp_path, caplog, beside):
     output = tiny.host_output(tmp_path / "out", data, model, eval=False)

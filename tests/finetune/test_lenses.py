@@ -14,7 +14,7 @@ from fragprune_plugins.workbench.scenes.dataset import load_dataset
 from fragprune_plugins.workbench.scenes.lenses import Lens
 
 WIDTH, HEIGHT = 96, 64
-EYE = torch.eye(3, dtype=torch.float64)
+EYE, ORIGIN = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
 LENSES = {
     "radial": ((-0.12, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), False),
     "opencv": ((-0.1, 0.02, 0.004, -0.003, 0.0, 0.0, 0.0, 0.0), False),
@@ -74,7 +74,7 @@ def bent(of: Lens):
 @pytest.mark.parametrize("name", LENSES)
 def test_a_straightened_photograph_is_what_its_pinhole_camera_sees(name):
     of = lens(name)
-    camera = of.camera(EYE, torch.zeros(3, dtype=torch.float64))
+    camera = of.camera(EYE, ORIGIN)
     found = of.straighten(bent(of), camera)
     want = world(*pixels(camera.fx, camera.fy, camera.cx, camera.cy))
     # 1.5 grey levels: two roundings, and linear interpolation of a picture that bends by at most
@@ -86,7 +86,7 @@ def test_a_straightened_photograph_is_what_its_pinhole_camera_sees(name):
 def test_a_straight_lens_needs_no_opencv(monkeypatch):
     monkeypatch.setitem(sys.modules, "cv2", None)
     of = Lens(WIDTH, HEIGHT, 70, 72, 50, 31, (0.0,) * 8)
-    camera = of.camera(EYE, torch.zeros(3, dtype=torch.float64))
+    camera = of.camera(EYE, ORIGIN)
     assert of.straight
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (70, 72, 50, 31)
 
@@ -94,7 +94,7 @@ def test_a_straight_lens_needs_no_opencv(monkeypatch):
 def test_without_opencv_a_bent_lens_is_refused_with_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(DatasetError, match=r"fragprune-plugins\[undistort\].*image_undistorter"):
-        lens("radial").camera(EYE, torch.zeros(3, dtype=torch.float64))
+        lens("radial").camera(EYE, ORIGIN)
 
 
 def write_photographs(folder, of: Lens, size=(WIDTH, HEIGHT)):
@@ -102,6 +102,14 @@ def write_photographs(folder, of: Lens, size=(WIDTH, HEIGHT)):
     photograph = Image.fromarray(bent(of)).resize(size)
     for i in range(9):
         photograph.save(folder / f"view{i}.png")
+
+
+def assert_straight(shot, of: Lens):
+    """A photograph is what the pinhole camera of its lens sees."""
+    camera = of.camera(EYE, ORIGIN)
+    want = world(*pixels(camera.fx, camera.fy, camera.cx, camera.cy))
+    assert shot.view.tan_fov_x == pytest.approx(WIDTH / (2 * camera.fx))
+    assert abs(255 * shot.image[0].numpy() - want).max() < 1.5
 
 
 @pytest.mark.parametrize(
@@ -123,19 +131,14 @@ def write_photographs(folder, of: Lens, size=(WIDTH, HEIGHT)):
     ],
 )
 def test_colmaps_lens_models(tmp_path, model, numbers, fy, coefficients):
-    fisheye = "FISHEYE" in model
-    of = Lens(WIDTH, HEIGHT, 70, fy, 50, 31, coefficients, fisheye)
+    of = Lens(WIDTH, HEIGHT, 70, fy, 50, 31, coefficients, "FISHEYE" in model)
     write_photographs(tmp_path / "images", of)
     sparse = tmp_path / "sparse" / "0"
     sparse.mkdir(parents=True)
     (sparse / "cameras.txt").write_text(f"1 {model} {WIDTH} {HEIGHT} {numbers}\n")
     rows = [f"{i + 1} 1 0 0 0 {i / 10} 0 0 1 view{i}.png\n\n" for i in range(9)]
     (sparse / "images.txt").write_text("".join(rows))
-    shot = load_dataset(tmp_path).train[0]
-    camera = of.camera(EYE, torch.zeros(3, dtype=torch.float64))
-    want = world(*pixels(camera.fx, camera.fy, camera.cx, camera.cy))
-    assert shot.view.tan_fov_x == pytest.approx(WIDTH / (2 * camera.fx))
-    assert abs(255 * shot.image[0].numpy() - want).max() < 1.5
+    assert_straight(load_dataset(tmp_path).train[0], of)
 
 
 def test_nerfstudios_file_straightens_with_each_frames_own_lens(tmp_path):
@@ -143,25 +146,21 @@ def test_nerfstudios_file_straightens_with_each_frames_own_lens(tmp_path):
     write_photographs(tmp_path / "images", of)
     k1, k2, p1, p2 = of.coefficients[:4]
     bent_frame = {"k1": k1, "k2": k2, "p1": p1, "p2": p2}
-    frames = []
-    for i in range(9):
-        pose = torch.eye(4).tolist()
-        frames.append({"file_path": f"images/view{i}.png", "transform_matrix": pose})
-        frames[-1] |= bent_frame if i == 1 else {}
+    poses = {"transform_matrix": torch.eye(4).tolist()}
+    frames = [{"file_path": f"images/view{i}.png"} | poses for i in range(9)]
+    frames[1] |= bent_frame
     shared = {"fl_x": 70, "fl_y": 72, "cx": 50, "cy": 31, "w": WIDTH, "h": HEIGHT}
     content = {"camera_model": "OPENCV", **shared, "frames": frames}
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     first, second = load_dataset(tmp_path).train[:2]
-    camera = of.camera(EYE, torch.zeros(3, dtype=torch.float64))
-    want = world(*pixels(camera.fx, camera.fy, camera.cx, camera.cy))
-    assert abs(255 * first.image[0].numpy() - want).max() < 1.5
+    assert_straight(first, of)
     assert second.lens is None
     assert second.view.tan_fov_y == pytest.approx(HEIGHT / (2 * 72))
 
 
 def test_smaller_images_are_straightened_by_the_same_lens(tmp_path):
     large, small = lens("opencv", 2 * WIDTH, 2 * HEIGHT), lens("opencv")
-    camera = large.camera(EYE, torch.zeros(3, dtype=torch.float64))
+    camera = large.camera(EYE, ORIGIN)
     found = large.straighten(bent(small), camera)  # images_2 of the same photographs
     seen = camera.resized(WIDTH, HEIGHT)
     want = world(*pixels(seen.fx, seen.fy, seen.cx, seen.cy))

@@ -10,7 +10,9 @@ from finetune import tiny
 from safetensors.torch import save_file
 
 from fragprune_plugins.errors import CheckpointError, OutputError
+from fragprune_plugins.learning import schedule
 from fragprune_plugins.learning.goals import Control, Fewer, Portable, Pressure
+from fragprune_plugins.learning.interruption import sigterm_interrupts
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.workbench.finetune import resuming
 from fragprune_plugins.workbench.finetune.api import finetune
@@ -48,21 +50,33 @@ def require_same(one, other):
     assert one.progress == other.progress
 
 
+def warming_up(patch):
+    """Thresholds open after 8 of 12 steps."""
+    patch.setattr(schedule, "_LEARNING_STEPS", 4)
+
+
 @pytest.mark.parametrize(
-    "settings",
+    ("settings", "prepare"),
     [
-        Settings(iterations=STEPS),
-        Settings(iterations=STEPS, train="opacity", goal=Pressure(1e-3)),
-        Settings(iterations=STEPS, dropout=0.2),
-        Settings(iterations=STEPS, train="appearance", goal=Fewer(1.5)),
-        Settings(iterations=STEPS, goal=Control(), seed=3),
-        Settings(iterations=STEPS, goal=Portable()),
+        (Settings(iterations=STEPS), None),
+        (Settings(iterations=STEPS, train="opacity", goal=Pressure(1e-3)), None),
+        (Settings(iterations=STEPS, dropout=0.2), None),
+        (Settings(iterations=STEPS, train="appearance", goal=Fewer(1.5)), None),
+        (Settings(iterations=STEPS, goal=Control(), seed=3), None),
+        (Settings(iterations=STEPS, goal=Portable()), None),
+        (Settings(iterations=STEPS), warming_up),
+        (Settings(iterations=STEPS, goal=Faster(1.2)), tiny.exact_clock),
     ],
-    ids=["all", "opacity", "dropout", "target", "control", "portable"],
+    ids=[
+        *("all", "opacity", "dropout", "target", "control", "portable"),
+        *("warm-up", "target time"),
+    ],
 )
 def test_cut_off_again_and_again_it_ends_as_if_never_cut(
-    model, dataset, tmp_path, monkeypatch, settings
+    model, dataset, tmp_path, monkeypatch, settings, prepare
 ):
+    if prepare:
+        prepare(monkeypatch)
     path, told = tmp_path / "out.fragprune-unfinished", []
     whole = run(model, dataset, settings)
     for cut in (2, 5, 8):  # before a checkpoint, and after one or two more
@@ -73,16 +87,6 @@ def test_cut_off_again_and_again_it_ends_as_if_never_cut(
     ]
     assert result.resumed_at == 9
     require_same(whole, result)
-
-
-def test_a_target_time_that_was_cut_off_keeps_what_was_timed(model, dataset, tmp_path, monkeypatch):
-    tiny.exact_clock(monkeypatch)
-    settings, path = Settings(iterations=STEPS, goal=Faster(1.2)), tmp_path / "unfinished"
-
-    whole = run(model, dataset, settings)
-    for cut in (5, 8):
-        run(model, dataset, settings, path, cut=cut, monkeypatch=monkeypatch)
-    require_same(whole, run(model, dataset, settings, path))
 
 
 def test_photographs_are_read_once_and_a_changed_one_is_noticed(tmp_path, monkeypatch):
@@ -100,24 +104,11 @@ def test_photographs_are_read_once_and_a_changed_one_is_noticed(tmp_path, monkey
     assert asked() != first
 
 
-def test_a_warm_up_that_was_cut_off_goes_on(model, dataset, tmp_path, monkeypatch):
-    from fragprune_plugins.learning import schedule
-
-    monkeypatch.setattr(schedule, "_LEARNING_STEPS", 4)  # thresholds open after 8 of 12 steps
-    whole = run(model, dataset, Settings(iterations=STEPS))
-    path = tmp_path / "out.fragprune-unfinished"
-    for cut in (5, 8):
-        run(model, dataset, Settings(iterations=STEPS), path, cut=cut, monkeypatch=monkeypatch)
-    require_same(whole, run(model, dataset, Settings(iterations=STEPS), path))
-
-
 @pytest.mark.usefixtures("ctrl_c")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_waits_for_the_end_of_its_step_and_is_resumed_from_there(
     model, dataset, tmp_path, monkeypatch, number
 ):
-    from fragprune_plugins.learning.interruption import sigterm_interrupts
-
     settings, path = Settings(iterations=STEPS), tmp_path / "out.fragprune-unfinished"
     whole = run(model, dataset, settings)
     with monkeypatch.context() as patch, sigterm_interrupts():
@@ -171,14 +162,6 @@ def test_another_configuration_is_refused_and_named(
     assert unfinished.read_bytes() == before
 
 
-def truncated(path):
-    path.write_bytes(path.read_bytes()[:-9])
-
-
-def foreign(path):
-    save_file({"logits": torch.zeros(3)}, path)
-
-
 def not_finite(path):
     tensors, values = resuming.read(path, "cpu")
     tensors["exp_avg.opacity"][3] = torch.nan
@@ -209,9 +192,9 @@ def value(name, word):
 
 
 BROKEN = {
-    "cut off": truncated,
+    "cut off": lambda path: path.write_bytes(path.read_bytes()[:-9]),
     "empty": lambda path: path.write_bytes(b""),
-    "foreign": foreign,
+    "foreign": lambda path: save_file({"logits": torch.zeros(3)}, path),
     "not a number": not_finite,
     "a part is missing": tensors(lambda _: {"model.opacity": None}),
     "other rows": tensors(lambda _: {"model.opacity": torch.zeros(3, 1)}),

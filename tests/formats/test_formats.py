@@ -82,7 +82,7 @@ def test_what_is_written_comes_back(suffix, splat):
     if suffix in SORTED:
         splat = splat.keep(morton_order(splat))
     if suffix == ".splat":
-        splat = type(splat)(**{**vars(splat), "f_rest": splat.f_rest[:, :0]})
+        splat = replace(splat, f_rest=splat.f_rest[:, :0])
     found, bounds = apart(splat, back), BOUNDS[suffix]
     assert all(found[name] <= bounds[name] + 2e-6 for name in found), (found, bounds)  # float32
 
@@ -92,8 +92,7 @@ def test_what_is_written_comes_back(suffix, splat):
 @given(splat=splats)
 def test_thresholds_come_back_with_their_rows(suffix, splat):
     tau = torch.linspace(0.004, 0.97, len(splat))
-    store = ThresholdStore.from_falloff(tau)
-    back = through(suffix, replace(splat, thresholds=store)).thresholds
+    back = through(suffix, tiny.cut(splat, tau)).thresholds
     wanted = cutoffs.encode(tau if suffix not in SORTED else tau[morton_order(splat)])
     if back is None:  # a row alone may have been rounded to 1/255
         assert not wanted.any()
@@ -200,9 +199,7 @@ def test_a_turned_scene_looks_the_same_from_a_turned_camera(signs):
 
 
 def test_sog_beside_its_images(tmp_path):
-    splat = random_splat(60, 1, 0)
-    store = ThresholdStore.from_falloff(torch.linspace(0.01, 0.9, 60))
-    save(tmp_path / "a.sog", replace(splat, thresholds=store))
+    save(tmp_path / "a.sog", tiny.cut(random_splat(60, 1, 0), torch.linspace(0.01, 0.9, 60)))
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
         archive.extractall(tmp_path / "folder")
     one, other = load(tmp_path / "a.sog"), load(tmp_path / "folder" / "meta.json")
@@ -267,10 +264,10 @@ def test_more_gaussians_than_a_file_can_hold_are_not_allocated(tmp_path):
 
 def test_spz_of_a_scene_wider_than_its_usual_bits(tmp_path):
     splat = random_splat(5, 0, 0)
-    wide = type(splat)(**{**vars(splat), "xyz": splat.xyz * 5000})
+    wide = replace(splat, xyz=splat.xyz * 5000)
     save(tmp_path / "a.spz", wide)
     assert float((load(tmp_path / "a.spz").xyz - wide.xyz).abs().max()) <= 1 / 128
-    far = type(splat)(**{**vars(splat), "xyz": splat.xyz * 1e7})
+    far = replace(splat, xyz=splat.xyz * 1e7)
     with pytest.raises(OutputError, match="24 bits"):
         save(tmp_path / "b.spz", far)
     assert not (tmp_path / "b.spz").exists()

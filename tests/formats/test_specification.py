@@ -5,16 +5,16 @@ import json
 import re
 import struct
 import zipfile
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from finetune import tiny
 from formats.scenes import random_splat
 from PIL import Image
 
-from fragprune_plugins import ThresholdStore, load, save
+from fragprune_plugins import load, save
 from fragprune_plugins.workbench.models import cutoffs
 from fragprune_plugins.workbench.models.formats.ply import write_ply
 
@@ -24,8 +24,7 @@ COUNT = 30
 
 @pytest.fixture
 def model():
-    tau = torch.linspace(0.01, 0.95, COUNT)
-    pruned = replace(random_splat(COUNT, 1, 0), thresholds=ThresholdStore.from_falloff(tau))
+    pruned = tiny.cut(random_splat(COUNT, 1, 0), torch.linspace(0.01, 0.95, COUNT))
     return pruned.with_rules(stop=0.01)
 
 

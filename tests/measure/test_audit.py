@@ -10,7 +10,7 @@ from finetune import tiny
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fragprune_plugins import RasterInputs, ThresholdStore, engine_for
+from fragprune_plugins import RasterInputs, engine_for
 from fragprune_plugins.engines.fragments import fragments
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.workbench.audit.audit import (
@@ -104,14 +104,16 @@ def test_alone_is_what_pictures_without_one_gaussian_show():
     whole = engine.rasterize(replace(inputs, counts=True), None)
     expected = unclear = 0
     nothing = torch.full_like(splats.opacities, 1e-6)
+
+    def drawn(opacities):
+        changed = replace(splats, opacities=opacities)
+        return engine.rasterize(replace(inputs, splats=changed, counts=True), None)
+
     for row in range(len(splats)):
-        alone = torch.where(torch.arange(len(splats)) == row, splats.opacities, nothing)
-        there = engine.rasterize(
-            replace(inputs, splats=replace(splats, opacities=alone), counts=True), None
-        ).fragments
-        without = torch.where(torch.arange(len(splats)) == row, nothing, splats.opacities)
-        image = engine.rasterize(replace(inputs, splats=replace(splats, opacities=without)), None)
-        moved = (image.image - whole.image).abs().amax(dim=0)[there > 0]
+        one = torch.arange(len(splats)) == row
+        there = drawn(torch.where(one, splats.opacities, nothing)).fragments
+        without = drawn(torch.where(one, nothing, splats.opacities)).image
+        moved = (without - whole.image).abs().amax(dim=0)[there > 0]
         expected += int((moved < HALF_LEVEL).sum())
         unclear += int(((moved - HALF_LEVEL).abs() < 1e-6).sum())
     drawn = idle.as_dict()["fragments"]
@@ -169,7 +171,7 @@ def test_a_stop_is_priced_on_a_model_without_one_and_is_its_own_on_another():
 
 def test_a_pruned_model_is_measured_with_its_thresholds_and_without():
     splat = tiny.random_model()
-    pruned = replace(splat, thresholds=ThresholdStore.from_falloff(torch.full((len(splat),), 0.3)))
+    pruned = tiny.cut(splat, 0.3)
     views = [("view", tiny.cameras()[0].view())]
     found, _ = audit(pruned, views, engine=ENGINE, repeats=1)
     plain, _ = audit(splat, views, engine=ENGINE, repeats=1)

@@ -66,14 +66,11 @@ def put_weights(folder):
     (folder / metrics.WEIGHTS).touch()
 
 
-def test_lpips_is_never_made_up(cache, monkeypatch):
-    monkeypatch.setitem(sys.modules, "lpips", None)  # not installed
-    put_weights(cache)
-    assert lpips(torch.zeros(3, 16, 16), torch.zeros(3, 16, 16)) is None
-
-
-def test_lpips_downloads_nothing(cache, monkeypatch):
-    monkeypatch.setitem(sys.modules, "lpips", SimpleNamespace())  # without a network, even
+@pytest.mark.parametrize("installed", [False, True])
+def test_lpips_is_never_made_up_and_nothing_is_downloaded(cache, monkeypatch, installed):
+    monkeypatch.setitem(sys.modules, "lpips", SimpleNamespace() if installed else None)
+    if not installed:
+        put_weights(cache)
     assert lpips(torch.zeros(3, 16, 16), torch.zeros(3, 16, 16)) is None
 
 

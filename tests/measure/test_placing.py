@@ -96,12 +96,8 @@ def test_thin_haze_all_around_is_no_air():
     """Large faint Gaussians before every wall: no place is open, so cameras stay outside."""
     walls = room()
     haze = splat(0.2 * torch.randn(60, 3, generator=torch.Generator().manual_seed(1)), 1.0, 0.3)
-    model = Model(
-        **{
-            name: torch.cat([getattr(walls, name), getattr(haze, name)])
-            for name in ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
-        }
-    )
+    both = {name: torch.cat([each, haze.tensors[name]]) for name, each in walls.tensors.items()}
+    model = Model(**both)
     assert place(model, 4, ENGINE).enclosed < place(walls, 4, ENGINE).enclosed
 
 

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import pytest
+import scenes
 import torch
 from finetune import tiny
 from oracle import naive
@@ -29,21 +30,13 @@ def scene(truncated):
 
 def pixels(model, thresholds):
     """For each pixel of each view: the fragments that are drawn, and the background."""
-    splats = model.splats()
-    splats = replace(
-        splats, **{k: v.double() for k, v in vars(splats).items() if isinstance(v, torch.Tensor)}
-    )
-    for number, view in enumerate(VIEWS):
-        view = replace(
-            view, **{k: v.double() for k, v in vars(view).items() if isinstance(v, torch.Tensor)}
-        )
-        inputs = RasterInputs(view, splats)
+    for view in VIEWS:
+        inputs = scenes.cast(RasterInputs(view, model.splats()), torch.float64)
         ordered = naive.splats_of(inputs, thresholds)
-        opacities = {splat.row: splat.opacity for splat in ordered}
         for y in range(view.height):
             for x in range(view.width):
                 records = [r for r in naive.records_at(ordered, x, y)[0] if r.drawn]
-                yield number, records, view.background.tolist(), opacities
+                yield records, view.background.tolist()
 
 
 def colour(fragments, background):
@@ -60,7 +53,7 @@ def test_the_removal_error_is_estimated_without_bias(truncated):
     """Over many pixels the relative error is about sqrt(2 / times that a view is given)."""
     model, thresholds = scene(truncated)
     truth = torch.zeros(COUNT)
-    for _, records, background, _ in pixels(model, thresholds):
+    for records, background in pixels(model, thresholds):
         pairs = [(r.alpha, r.color) for r in records]
         whole = colour(pairs, background)
         for k, record in enumerate(records):

@@ -48,17 +48,12 @@ def test_a_loss_that_grows_about_as_the_pressure_does_is_met(start, gain, slope,
         assert min(abs(trial.loss - (bound - TOLERANCE / 2)) for trial in trials) < 2 * TOLERANCE
 
 
-def test_a_loss_that_stays_above_the_bound_ends_with_ever_less_pressure():
-    trials = search(lambda pressure: 1.0, 0.05, 2e-4)
-    pressures = [trial.pressure for trial in trials]
-    assert len(trials) == TRAININGS
-    assert pressures == sorted(pressures, reverse=True)
-
-
-def test_a_loss_that_stays_below_the_bound_ends_with_ever_more():
-    pressures = [trial.pressure for trial in search(lambda pressure: -1.0, 0.05, 2e-4)]
-    assert pressures == sorted(pressures)
-    assert pressures[-1] > 30 * pressures[0]
+@pytest.mark.parametrize(("loss", "less"), [(1.0, True), (-1.0, False)])
+def test_a_loss_on_one_side_of_the_bound_ends_with_ever_less_or_more_pressure(loss, less):
+    pressures = [trial.pressure for trial in search(lambda pressure: loss, 0.05, 2e-4)]
+    assert len(pressures) == TRAININGS
+    assert pressures == sorted(pressures, reverse=less)
+    assert less or pressures[-1] > 30 * pressures[0]
 
 
 Result = make_dataclass("Result", ["settings", "progress", "interrupted", "terminated"])

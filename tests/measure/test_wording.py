@@ -12,14 +12,10 @@ from fragprune_plugins.workbench.figures.wording import (
 )
 
 
-def measured(fragments, ms, psnr, error=0.01):
-    return {
-        "fragments_per_pixel": fragments,
-        "frame_ms": ms,
-        "frame_ms_se": error,
-        "psnr": psnr,
-        "views": 7,
-    }
+def measured(fragments, ms, psnr, error=0.01, **more):
+    figures = {"fragments_per_pixel": fragments, "frame_ms": ms, "frame_ms_se": error}
+    others = {"views": 7, "ssim": 0.9, "area_per_pixel": 40.0, "gaussians": 9}
+    return figures | others | {"psnr": psnr, "engine": "cpu", "device": "cpu"} | more
 
 
 BEFORE, AFTER = measured(39.1, 2.33, 30.09), measured(25.0, 2.07, 30.26)
@@ -64,32 +60,21 @@ def test_noise_is_noise_whichever_of_the_two_comes_first():
 
 
 @pytest.mark.parametrize(
-    ("now", "figure", "word"),
+    ("was", "now", "said", "figure"),
     [
-        (10.0, "2.0x", "fewer"),
-        (19.0, "1.05x", "fewer"),
-        (19.98, "1.00x", "as many"),
-        (20.0, "1.00x", "as many"),
-        (40, "2.0x", "more"),
+        *((20.0, 10.0, "2.00x fewer", "2.0x"), (20.0, 19.0, "1.05x fewer", "1.05x")),
+        *((20.0, 19.98, "as many", "1.00x"), (20.0, 20.0, "as many", "1.00x")),
+        (20.0, 40.0, "2.00x more", "2.0x"),
+        # where nothing is drawn there is no ratio
+        *((10.6, 0.0, "no", None), (0.0, 10.6, "more", None), (0.0, 0.0, "as many", None)),
     ],
 )
-def test_a_headline_of_fragments_says_fewer_or_more(now, figure, word):
-    first, *_ = headlines({"before": measured(20, 3, 30), "after": measured(now, 3, 30)}, None)
-    assert first == (figure, f"{word} fragments to draw: 20.0 → {now:.1f} a pixel")
-
-
-def test_more_fragments_are_not_called_fewer():
-    assert fewer(10.0, 25.0) == "2.50x more fragments (10.0 -> 25.0 per pixel)"
-    assert fewer(25.0, 25.1) == "as many fragments (25.0 -> 25.1 per pixel)"
-
-
-@pytest.mark.parametrize(
-    ("was", "now", "said"), [(10.6, 0.0, "no"), (0.0, 10.6, "more"), (0.0, 0.0, "as many")]
-)
-def test_where_nothing_is_drawn_there_is_no_ratio(was, now, said):
+def test_fragments_are_fewer_or_more_or_as_many(was, now, said, figure):
     assert fewer(was, now) == f"{said} fragments ({was:.1f} -> {now:.1f} per pixel)"
     first, *_ = headlines({"before": measured(was, 3, 30), "after": measured(now, 3, 30)}, None)
-    assert first == (f"{was:.1f} → {now:.1f}", "fragments to draw a pixel")
+    both, word = f"{was:.1f} → {now:.1f}", said.rpartition("x ")[2]
+    whole = (figure, f"{word} fragments to draw: {both} a pixel")
+    assert first == (whole if figure else (both, "fragments to draw a pixel"))
 
 
 @pytest.mark.parametrize("command", ["run", "finetune"])
@@ -145,34 +130,22 @@ def test_a_control_says_that_it_is_one():
     assert "pruning" not in line
 
 
-ITSELF = {"target": "itself"}
-
-
 @pytest.mark.parametrize("infinite", [float("inf"), None])  # None: read from a record
-@pytest.mark.parametrize(("psnr", "warned"), [(45.2, False), (34.9, True)])
+@pytest.mark.parametrize(("psnr", "warned"), [(45.2, False), (34.9, True), (None, False)])
 def test_against_itself_there_is_no_figure_before_and_no_control(infinite, psnr, warned):
-    rows = {"ssim": 1.0, "area_per_pixel": 40.0, "gaussians": 9, "engine": "cpu"}
-    before = measured(39.1, 2.33, infinite) | rows | ITSELF | {"device": "cpu"}
-    after = measured(25.0, 2.07, psnr) | rows | ITSELF | {"device": "cpu"}
-    line = outcome("finetune", data() | {"before": before, "after": after}, None)
-    assert f"{psnr:.2f} dB PSNR against itself on 7 views that were held out." in line
+    before = measured(39.1, 2.33, infinite, target="itself")
+    after = measured(25.0, 2.07, psnr or infinite, target="itself")
+    figures = data() | {"before": before, "after": after}
+    line = outcome("finetune", figures, None)
+    quality = f"{psnr:.2f} dB PSNR against itself" if psnr else "equal pictures"
+    assert f"{quality} on 7 views that were held out." in line
     assert "No photograph was used." in line
     assert "control" not in line
     assert ("Warning: below 35 dB the change can be seen." in line) == warned
     first, *_ = describe({"before": before, "after": after}).splitlines()[1:]
-    assert first.split() == ["PSNR", "to", "itself,", "dB", "equal", f"{psnr:.2f}"]
-
-
-@pytest.mark.parametrize("infinite", [float("inf"), None])
-def test_pictures_that_are_equal_have_no_decibels(infinite):
-    rows = {"ssim": 1.0, "area_per_pixel": 40.0, "gaussians": 9, "engine": "cpu", "device": "cpu"}
-    each = measured(39.1, 2.33, infinite) | rows | ITSELF
-    figures = data() | {"before": each, "after": dict(each)}
-    assert "(no difference beyond the noise), equal pictures on 7 views" in gain(each, dict(each))
-    assert "Warning" not in outcome("finetune", figures, None)
-    assert headlines(figures, None)[2][0] == "equal"
-    first, *_ = describe({"A": each, "B": dict(each)}).splitlines()[1:]
-    assert first.split() == ["PSNR", "to", "itself,", "dB", "equal", "equal"]
+    shown = f"{psnr:.2f}" if psnr else "equal"
+    assert first.split() == ["PSNR", "to", "itself,", "dB", "equal", shown]
+    assert psnr or headlines(figures, None)[2][0] == "equal"
 
 
 @pytest.mark.parametrize(
@@ -184,9 +157,7 @@ def test_pictures_that_are_equal_have_no_decibels(infinite):
     ],
 )
 def test_a_table_says_in_words_what_a_ratio_means(before, after, change, frame):
-    rows = {"ssim": 0.9, "area_per_pixel": 40.0, "gaussians": 9, "engine": "cpu", "device": "cpu"}
-    less = {"area_per_pixel": 32.0}
-    text = describe({"original": before | rows, "pruned": after | rows | less})
+    text = describe({"original": before, "pruned": after | {"area_per_pixel": 32.0}})
     lines = {line[:31].strip(): line for line in text.splitlines()}
     assert lines["fragments per pixel"].endswith(f" {change}")
     assert lines["area per pixel, other viewers"].endswith(" 1.25x less")

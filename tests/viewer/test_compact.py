@@ -2,14 +2,13 @@
 
 import json
 import zlib
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from finetune import tiny
 
-from fragprune_plugins import Model, ThresholdStore, overview
+from fragprune_plugins import Model, overview
 from fragprune_plugins.workbench.models import formats
 from fragprune_plugins.workbench.models.formats.arrays import morton_order
 from fragprune_plugins.workbench.view.packing import compact, pack
@@ -17,9 +16,7 @@ from fragprune_plugins.workbench.view.site import Layer, compacted, make_site
 
 
 def a_model(degree: int = 1, count: int = 400) -> Model:
-    splat = tiny.random_model(count, degree, 5)
-    thresholds = torch.linspace(0.002, 0.9, count)
-    return replace(splat, thresholds=ThresholdStore.from_falloff(thresholds))
+    return tiny.cut(tiny.random_model(count, degree, 5), torch.linspace(0.002, 0.9, count))
 
 
 def of_spz(folder, model: Model) -> Model:
@@ -64,15 +61,9 @@ def expand(data: bytes, facts: dict) -> tuple[np.ndarray, np.ndarray]:
     harmonics = book[planes(rest, rows)].T.reshape(rows, rest)[which]
     assert not len(stream)
     turned = np.rint(turns * 32767).astype("<i2").view("<u2")
-    geometry = [
-        np.ascontiguousarray(means).view("<u2"),
-        opacities,
-        cutoffs,
-        turned,
-        scales,
-        0 * opacities,
-    ]
-    return np.hstack(geometry), np.hstack([colours, harmonics])
+    places = np.ascontiguousarray(means).view("<u2")
+    geometry = np.hstack([places, opacities, cutoffs, turned, scales, 0 * opacities])
+    return geometry, np.hstack([colours, harmonics])
 
 
 def tables(model: Model) -> tuple[np.ndarray, np.ndarray]:

@@ -1,14 +1,12 @@
 """A model's tables hold what the model holds, to the stated precision."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from finetune import tiny
 
-from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.workbench.view.packing import pack
 
 
@@ -34,7 +32,7 @@ def read(data, facts):
 def test_tables_hold_the_model(degree):
     splat = tiny.random_model(degree=degree)
     thresholds = torch.linspace(0.005, 0.9, len(splat))
-    data, facts = pack(replace(splat, thresholds=ThresholdStore.from_falloff(thresholds)))
+    data, facts = pack(tiny.cut(splat, thresholds))
     texels = -(-3 * (degree + 1) ** 2 // 8)  # of eight half floats
     assert len(data) == (32 + 16 * texels) * len(splat)
     assert facts["degree"] == degree
@@ -61,9 +59,7 @@ def test_without_thresholds_every_cutoff_is_the_last():
 
 
 def test_a_threshold_below_one_in_255_decides_nothing():
-    splat = tiny.random_model()
-    store = ThresholdStore.from_falloff(torch.full((len(splat),), 1e-3))
-    assert (read(*pack(replace(splat, thresholds=store)))[0]["cutoff"] == 65535).all()
+    assert (read(*pack(tiny.cut(tiny.random_model(), 1e-3)))[0]["cutoff"] == 65535).all()
 
 
 def test_scales_that_are_all_equal():
