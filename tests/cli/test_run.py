@@ -59,8 +59,6 @@ def test_the_line_has_frame_times_and_says_that_no_control_was_run(scene, tmp_pa
     result = run("run", *WORDS, *command(scene, tmp_path / "out"))
     assert caplog.text.count("nothing is proved") == 1  # not once in each stage
     assert result.exit_code == 0, result.stderr
-    assert f"fragprune view {models(tmp_path / 'out')[1]}" in result.stdout
-    assert f"fragprune report {tmp_path / 'out'}" in result.stdout
     (line,) = (line for line in result.stdout.splitlines() if "x fewer fragments" in line)
     assert " ms (" in line
     assert "no control was run; to see, add --stage finetune --control" in line
@@ -89,12 +87,23 @@ def test_the_host_takes_as_many_threads_as_it_is_given(words, threads, monkeypat
         ("chkpnt16.pth", (), False),  # RT-4DGS
     ],
 )
-def test_a_page_is_advised_only_of_a_model_that_view_shows(name, beside, shown, trained, tmp_path):
-    model = tmp_path / name
-    shutil.copy(trained[1]["model_before"], model)
+def test_a_page_is_advised_only_of_a_model_that_view_shows(
+    name, beside, shown, trained, tmp_path, monkeypatch
+):
+    found, model = trained[1], tmp_path / name
+    shutil.copy(found["model_before"], model)
     for each in beside:
         (tmp_path / each).touch()
-    assert work._viewable(model) == shown
+    summary = launch.RunSummary(
+        **{"adapter": "a host", "engine": "cpu", "device": "cpu", "stage": "finetune"},
+        **{"fragments_before": 2.0, "fragments_after": 1.0, "train_seconds": 1.0, "curves": []},
+        **{"steps": 6, "gaussians": found["gaussians"], "settings": found["settings"]},
+        **{"model_after": model, "output": tmp_path},
+    )
+    monkeypatch.setattr(launch, "run", lambda *_: summary)
+    said = run("run", "--", HOST / "train.py").stdout
+    assert (f"fragprune view {model}" in said) == shown
+    assert f"fragprune report {tmp_path}" in said
 
 
 @pytest.mark.parametrize(
