@@ -7,8 +7,11 @@ from typing import Any
 
 import torch
 
+import fragprune_gsplat
+from fragprune_gaussian_splatting import GaussianSplatting
 from fragprune_graphdeco import GraphdecoDialect
 from fragprune_graphdeco.adapter import completed
+from fragprune_gsplat import Gsplat
 from fragprune_mcmc import MCMC, following_copies
 from fragprune_plugins.adapting import CHECKPOINT_KEY, Role, RowTrace, revised
 from fragprune_plugins.hosts.findings import Match
@@ -169,3 +172,26 @@ class DrawsOtherwiseEachTime(Vanilla3DGS):
 
     def dialect(self, repo: Any) -> Wavering:
         return Wavering(**vars(super().dialect(repo)))
+
+
+class HoldsStepsBack(GaussianSplatting):
+    """Holds back the step in which opacities would be reset, and the thresholds' with it."""
+
+    seams = revised(GaussianSplatting.seams, {"OpacityResetter.optim_step": {"how": None}})
+
+
+@contextmanager
+def littered(call: Any) -> Iterator[RowTrace]:
+    with fragprune_gsplat.tracing(call) as trace:
+        yield trace
+    rows = torch.zeros(len(call.model["means"]))
+    call.model[fragprune_gsplat.ROWS] = torch.nn.Parameter(rows, requires_grad=False)
+
+
+class LeavesItsRowNumbers(Gsplat):
+    """Leaves its row numbers in the user's model."""
+
+    seams = tuple(
+        replace(seam, how=littered) if seam.role is Role.REARRANGE else seam
+        for seam in Gsplat.seams
+    )

@@ -9,10 +9,13 @@ from pathlib import Path
 
 import pytest
 from conformance import broken_adapters as broken
+from installed.gaussian_splatting_host import GaussianSplattingHost
+from installed.gsplat_host import GsplatHost
 from miniatures.mcmc import MCMCHost
 from miniatures.vanilla_3dgs import HOST
 
 from fragprune_plugins import testing
+from fragprune_plugins.adapting import HostRepo
 from fragprune_plugins.hosts.seams import Role
 from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.testing import Host, invariants
@@ -57,6 +60,21 @@ def test_two_rows_with_the_moments_of_one_are_found(tmp_path):
     inheriting = invariants.Case(broken.LetsMomentsBeInherited(), MCMCHost(), tmp_path, examples=1)
     with pytest.raises(FreshProcessError, match="two rows have the moments of one"):
         fresh(invariants.alignment, inheriting)
+
+
+@pytest.mark.parametrize(
+    ("check", "adapter", "host", "words"),
+    [
+        (invariants.freeze, broken.HoldsStepsBack, GaussianSplattingHost, "0 threshold steps of 4"),
+        (invariants.neutral_is_the_host, broken.LeavesItsRowNumbers, GsplatHost, "became"),
+    ],
+)
+def test_a_fault_is_found_on_the_package_that_shows_it(check, adapter, host, words):
+    installed = HostRepo.installed(host().package)
+    if installed is None:
+        pytest.skip(f"{host().package} is not installed")
+    with pytest.raises(FreshProcessError, match=words):
+        fresh(check, invariants.Case(adapter(), host(), installed.root, examples=1))
 
 
 def test_a_host_that_forgets_to_be_followed_is_found():
