@@ -186,8 +186,8 @@ def _misfits(repo: HostRepo, module: str) -> tuple[str, ...]:
         for each in every(tree, ast.If)
         if isinstance(each.test, ast.Name) or "hasattr(" in ast.unparse(each.test)
     ]
-    parts = (each for node in (*asked, *every(tree, ast.Try)) for each in node.body)
-    tried = {inner for each in parts for inner in nodes(each)}
+    parts = [*(each.body for each in asked), *(each.body for each in every(tree, ast.Try))]
+    tried = {inner for part in parts for each in part for inner in nodes(each)}
     model = _definition(repo, MODEL, "GaussianModel")[1]
     pairs = [(ast.unparse(to), ast.unparse(value)) for to, value in assigned(tree)]
     models = {to for to, value in pairs if value.startswith("GaussianModel(")}
