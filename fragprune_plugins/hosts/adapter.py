@@ -124,7 +124,7 @@ def read_config(config: ConfigFile, path: Path) -> dict[str, Any]:
             return config.read(path)
         except ImportError as error:
             package = Missing((error.name or "").split(".")[0], str(path))
-            needed, remedy = "a package with which the host reads it", f"Run: {install([package])}"
+            needed, remedy = "a package with which the host reads it", install([package])
             raise HostNeedsError(f"{config.flag} {path}", str(error), needed, remedy) from error
 
 

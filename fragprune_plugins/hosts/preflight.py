@@ -24,6 +24,12 @@ DISTRIBUTIONS = {
 }
 """What pip calls a package that is imported under another name."""
 
+# To any other name than these and those above pip may answer with something else.
+_SAME_NAME = """
+    einops icecream imageio joblib kornia lpips matplotlib numpy omegaconf open3d pandas plyfile
+    scipy tensorboard timm torch torchmetrics torchvision tqdm transformers trimesh wandb
+"""
+
 
 @dataclass(frozen=True)
 class Missing:
@@ -38,17 +44,23 @@ class Missing:
     at: str
 
     @property
-    def distribution(self) -> str:
-        """The package's name for pip."""
-        return DISTRIBUTIONS.get(self.module, self.module)
+    def distribution(self) -> str | None:
+        """The package's name for pip; None if it is not known."""
+        same = self.module if self.module in _SAME_NAME.split() else None
+        return DISTRIBUTIONS.get(self.module, same)
 
     def __str__(self) -> str:
         return f"{self.module} ({self.at})"
 
 
-def install(missing: Iterable[Missing]) -> str:
-    """The command that installs them."""
-    return " ".join(["pip install", *(each.distribution for each in missing)])
+def install(missing: Collection[Missing]) -> str:
+    """What to do to get them: pip's command for those that it has, and where to read of others."""
+    by_pip = [each.distribution for each in missing if each.distribution]
+    others = [each.module for each in missing if not each.distribution]
+    ways = [f"Run: pip install {' '.join(by_pip)}"] if by_pip else []
+    if others:
+        ways.append(f"Install as the host's own instructions say: {', '.join(others)}")
+    return "\n".join(ways)
 
 
 def missing_imports(
@@ -88,7 +100,7 @@ def expect(
     found, remedies = [], []
     if missing:
         found.append(f"not installed: {', '.join(map(str, missing))}")
-        remedies.append(f"Run: {install(missing)}")
+        remedies.append(install(missing))
     if absent:
         found.append(f"no folder {data}")
         remedies.append("Check the path of the data.")

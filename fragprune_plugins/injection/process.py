@@ -52,7 +52,7 @@ def telling(script: Path, root: Path) -> Iterator[None]:
             remedy = "fragprune raised it. Report it with the traceback above."
         elif isinstance(error, ModuleNotFoundError) and not HostRepo(root).path(lacking):
             expected = "what the host itself imports"
-            remedy = f"Run: {preflight.install([preflight.Missing(lacking, where)])}"
+            remedy = preflight.install([preflight.Missing(lacking, where)])
         found = f"{type(error).__name__}{f': {message}' if message else ''}"
         raise HostFailed(where, found, expected, remedy) from error
 

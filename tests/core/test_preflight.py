@@ -102,9 +102,13 @@ def test_an_installed_host_is_followed_and_its_neighbours_are_not(tmp_path):
     assert {module for module, _ in found} == {"neighbour", "absent_toyhost"}
 
 
-def test_pip_is_told_its_own_names():
-    named = [Missing(name, "a.py:1") for name in ("cv2", "PIL", "icecream")]
-    assert install(named) == "pip install opencv-python-headless pillow icecream"
+def test_pip_is_told_its_own_names_and_not_those_that_it_may_have_for_something_else():
+    named = [Missing(name, "a.py:1") for name in ("cv2", "clip", "PIL", "icecream", "tf")]
+    assert install(named).splitlines() == [
+        "Run: pip install opencv-python-headless pillow icecream",
+        "Install as the host's own instructions say: clip, tf",
+    ]
+    assert install(named[1:2]) == "Install as the host's own instructions say: clip"
 
 
 def test_our_own_small_host_lacks_nothing():

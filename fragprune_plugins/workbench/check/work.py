@@ -73,7 +73,7 @@ def _single(
         lines += ["", *_in_short(tried, fitting, judged.differs)]
     if missing:
         lines += ["", f"Not installed, but imported: {', '.join(map(str, missing))}"]
-        lines += [f"  {install(missing)}"]
+        lines += [f"  {way}" for way in install(missing).splitlines()]
     if judged.kind != "inside":
         lines += ["", _conclusion(repo, fitting)]
     data = {
