@@ -13,7 +13,7 @@ from torch import Tensor
 
 from fragprune_plugins.constants import NEUTRAL_LOGIT, TILE
 from fragprune_plugins.engines.reference import ReferenceEngine, camera_of, gaussians_of, options_of
-from fragprune_plugins.types import Compensation, Footprints, RasterInputs, Rim, Splats, View
+from fragprune_plugins.types import Footprints, RasterInputs, Splats, View
 from reference_renderer import project
 from reference_renderer.covariance import rotation_matrices
 
@@ -35,12 +35,9 @@ def random_scene(
     flat: bool = False,
     features: int = 0,
     offsets: bool = False,
-    compensation: Compensation = "none",
-    scale_modifier: float = 1.0,
-    stop: float | None = None,
-    rim: Rim = "hard",
     dtype: torch.dtype = torch.float32,
     device: torch.device | str = "cpu",
+    **dialect: Any,
 ) -> RasterInputs:
     """Anisotropic splats of 0.3 to 12 pixels before a turned camera, awkward ones included.
 
@@ -59,12 +56,9 @@ def random_scene(
         flat: give two scales each: surfels.
         features: channels to blend beside colour; 0 for none.
         offsets: give sample offsets of up to half a pixel.
-        compensation: as in ``RasterInputs``.
-        scale_modifier: as in ``RasterInputs``.
-        stop: as in ``RasterInputs``.
-        rim: as in ``RasterInputs``.
         dtype: of every tensor.
         device: of every tensor.
+        dialect: further fields of ``RasterInputs``.
     """
     generator = torch.Generator().manual_seed(seed)
     view = random_view(generator, width, height)
@@ -91,11 +85,8 @@ def random_scene(
     inputs = RasterInputs(
         view=view,
         splats=splats,
-        compensation=compensation,
-        scale_modifier=scale_modifier,
-        stop=stop,
-        rim=rim,
         sample_offsets=_uniform(generator, -0.5, 0.5, height, width, 2) if offsets else None,
+        **dialect,
     )
     return cast(inputs, dtype, device)
 

@@ -17,7 +17,6 @@ from unittest import mock
 import scenes
 import torch
 from gpu.emulated import BrokenDevice, Numbers
-from native.test_dialects import dialect
 from native.test_invariants import everything
 from spacetime import cut, moment, splats
 
@@ -91,7 +90,7 @@ def poisoned(inputs: RasterInputs, seed: int) -> RasterInputs:
 def draw(device: EmulatedDevice, seed: int) -> None:
     """All kernels, in one of the dialects."""
     device.seed = seed
-    inputs = dialect(seed, **DIALECTS[seed % len(DIALECTS)])
+    inputs = scenes.random_scene(seed, **DIALECTS[seed % len(DIALECTS)])
     thresholds = scenes.random_thresholds(seed, len(inputs.splats))
     for deterministic in (False, True):
         engine = CudaEngine(device, deterministic=deterministic)

@@ -10,15 +10,17 @@ from dataclasses import replace
 import pytest
 import scenes
 import torch
+from native import test_against_oracle as native
 from native.test_against_oracle import (
     check_gradients,
     draw_pair,
     expect_oracle,
+    projected,
     test_changes_in_place_are_noticed,
     test_nothing_to_draw_leaves_the_background,
     test_tall_stacks_stop_where_the_oracle_does,
 )
-from native.test_dialects import dialect, flat, test_offsets_beyond_all_bounds_are_refused
+from native.test_dialects import test_offsets_beyond_all_bounds_are_refused
 from native.test_invariants import assert_identical, everything
 
 from fragprune_plugins.engines.cpu.engine import CpuEngine
@@ -36,38 +38,25 @@ __all__ = [
     "test_tall_stacks_stop_where_the_oracle_does",
 ]
 
-KINDS = {
-    "plain": {},
-    "sh 3, antialiasing": {"sh_degree": 3, "compensation": "antialiasing"},
-    "sh 0, cov3d": {"cov3d": True, "sh_degree": 0},
-    "sh 2, one tile and a bit": {"width": 17, "height": 33, "sh_degree": 2},
-    "mip, offsets, absolute gradient": {
-        "compensation": "mip",
-        "dilation": 0.1,
-        "offsets": True,
-        "absolute_gradient": True,
-    },
-    "near, low cap": {"near": 2.5, "alpha_max": 0.6, "cap_gradient": False},
-    "features, colours": {"features": 3, "colors": True, "scale_modifier": 0.7},
-    "stopped": {"stop": 0.2},
-    "scores": {"scores": True},
-}
+KINDS = [
+    *("plain", "sh 3, antialiasing", "cov3d", "odd size, sh 2", "colours, modifier", "mip", "near"),
+    *("capped gradient", "absolute gradient", "features, colours, offsets", "stopped", "scores"),
+]
+"""Of the cpu engine's dialects those that reach other kernels or macros."""
 
 
-@pytest.mark.parametrize(("kind", "thresholded"), [("plain", False), *((k, True) for k in KINDS)])
+@pytest.mark.parametrize(("kind", "truncated"), [("plain", False), *((k, True) for k in KINDS)])
 def test_images_and_gradients_equal_the_oracle(
-    engine: CudaEngine, kind: str, thresholded: bool
+    engine: CudaEngine, kind: str, truncated: bool
 ) -> None:
-    inputs = dialect(1, **KINDS[kind])
-    thresholds = scenes.random_thresholds(1, 60) if thresholded else None
-    expect_oracle(engine, inputs, thresholds)
+    inputs = scenes.random_scene(1, **native.KINDS[kind])
+    expect_oracle(engine, inputs, scenes.random_thresholds(1, 60) if truncated else None)
 
 
-@pytest.mark.parametrize("kind", ["plain", "features, colours"])
+@pytest.mark.parametrize("kind", ["absolute gradient", "features, colours, offsets"])
 def test_footprints_equal_the_oracle(engine: CudaEngine, kind: str) -> None:
-    inputs = replace(flat(dialect(5, **KINDS[kind])), absolute_gradient=True)
-    thresholds = scenes.random_thresholds(5, 60)
-    expect_oracle(engine, inputs, thresholds)
+    inputs = projected(scenes.random_scene(5, **native.KINDS[kind]))
+    expect_oracle(engine, inputs, scenes.random_thresholds(5, 60))
 
 
 def test_a_soft_rim_is_refused(engine: CudaEngine) -> None:
@@ -81,7 +70,7 @@ def test_surfels_are_refused(engine: CudaEngine) -> None:
 
 
 def test_tiles_of_footprints_may_be_any_integers(engine: CudaEngine) -> None:
-    inputs = flat(dialect(5))
+    inputs = projected(scenes.random_scene(5))
     wide = replace(inputs, splats=replace(inputs.splats, tiles=inputs.splats.tiles.long()))
     drawn = [everything(engine, each, None)["image"] for each in (inputs, wide)]
     assert torch.equal(*drawn)
@@ -119,7 +108,7 @@ def test_deterministic_runs_agree_to_the_bit_whatever_the_order(device: Emulated
 def test_images_counts_and_scores_do_not_depend_on_the_order(
     engine: CudaEngine, device: EmulatedDevice
 ) -> None:
-    inputs = replace(scenes.random_scene(4, 300, 70, 50), scores=True, counts=True)
+    inputs = scenes.random_scene(4, 300, 70, 50, scores=True, counts=True)
     found = []
     for device.seed in (1, 2):
         found.append(engine.rasterize(inputs, None))
@@ -137,7 +126,7 @@ def test_images_counts_and_scores_do_not_depend_on_the_order(
 def test_larger_scenes_equal_the_cpu_engine(
     engine: CudaEngine, n: int, width: int, height: int, size: float
 ) -> None:
-    inputs = replace(scenes.random_scene(3, n, width, height, scale_modifier=size), counts=True)
+    inputs = scenes.random_scene(3, n, width, height, scale_modifier=size, counts=True)
     thresholds = scenes.random_thresholds(3, n)
     with torch.no_grad():
         expected = CpuEngine().rasterize(inputs, thresholds)

@@ -1,4 +1,4 @@
-"""One engine per build that runs on this machine."""
+"""One library and engine per build that runs on this machine."""
 
 import pytest
 from native.sanitize import building
@@ -8,9 +8,15 @@ from fragprune_plugins.engines.cpu.engine import CpuEngine
 
 
 @pytest.fixture(params=binding.usable_builds(), scope="session")
-def engine(request: pytest.FixtureRequest) -> CpuEngine:
-    """The cpu engine, once per build."""
-    return CpuEngine(binding.open_build(request.param))
+def library(request: pytest.FixtureRequest) -> binding.Library:
+    """The compiled code, once per build."""
+    return binding.open_build(request.param)
+
+
+@pytest.fixture(scope="session")
+def engine(library: binding.Library) -> CpuEngine:
+    """The cpu engine, likewise."""
+    return CpuEngine(library)
 
 
 @pytest.fixture(scope="session")

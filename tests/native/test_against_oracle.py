@@ -36,7 +36,20 @@ KINDS = {
     "colours, modifier": {"colors": True, "scale_modifier": 0.7},
     "odd size, sh 2": {"width": 33, "height": 17, "sh_degree": 2},
     "stopped": {"stop": 0.3},
-    "soft rim": {"rim": "soft"},
+    "mip": {"compensation": "mip", "dilation": 0.1},
+    "near": {"near": 2.5},
+    "scores": {"scores": True},
+    "offsets": {"offsets": True},
+    "absolute gradient": {"absolute_gradient": True},
+    "low cap": {"alpha_max": 0.5},
+    "capped gradient": {"alpha_max": 0.6, "cap_gradient": False},
+    "no cap": {"alpha_max": 1.0, "cap_gradient": False},
+    "1 feature": {"features": 1},
+    "8 features": {"features": 8},
+    "features, colours, offsets": {"features": 3, "colors": True, "offsets": True},
+    "stopped, with features and scores": {"stop": 0.2, "features": 2, "scores": True},
+    "soft rim": {"rim": "soft", "offsets": True, "absolute_gradient": True},
+    "soft rim, with a capped gradient": {"rim": "soft", "alpha_max": 0.6, "cap_gradient": False},
     "soft rim, antialiasing, cov3d, stopped": {
         "rim": "soft",
         "compensation": "antialiasing",
@@ -44,9 +57,12 @@ KINDS = {
         "stop": 0.3,
     },
     "surfels": {"flat": True},
-    "surfels, stopped": {"flat": True, "stop": 0.3},
     "surfels, sh 3, modifier": {"flat": True, "sh_degree": 3, "scale_modifier": 0.7, "width": 33},
     "surfels, colours": {"flat": True, "colors": True},
+    "surfels, near": {"flat": True, "near": 2.5},
+    "surfels, low cap": {"flat": True, "alpha_max": 0.5},
+    "surfels, capped gradient": {"flat": True, "alpha_max": 0.6, "cap_gradient": False},
+    "surfels, stopped, scores": {"flat": True, "stop": 0.2, "scores": True},
 }
 
 
@@ -191,14 +207,25 @@ def expect_oracle(engine: CpuEngine, inputs: RasterInputs, thresholds: torch.Ten
         check_scores(truth, ours, same)
 
 
-@pytest.mark.parametrize("thresholded", [False, True], ids=["untruncated", "truncated"])
-@pytest.mark.parametrize(("kind", "seed"), [("plain", 1), *((kind, 0) for kind in KINDS)])
-def test_images_and_gradients_equal_the_oracle(
-    engine: CpuEngine, kind: str, seed: int, thresholded: bool
-) -> None:
-    inputs = scenes.random_scene(seed, **KINDS[kind])
-    thresholds = scenes.random_thresholds(seed, len(inputs.splats)) if thresholded else None
-    expect_oracle(engine, inputs, thresholds)
+def projected(inputs: RasterInputs) -> RasterInputs:
+    """The same as footprints of float32, projected in float64."""
+    return scenes.cast(scenes.footprints_of(scenes.cast(inputs, torch.float64)), torch.float32)
+
+
+@pytest.mark.parametrize(
+    ("kind", "how"),
+    [
+        (kind, how)
+        for kind in KINDS
+        for how in ("whole", "truncated", "projected before")
+        if how != "projected before" or "flat" not in KINDS[kind]
+    ],
+)
+def test_images_and_gradients_equal_the_oracle(engine: CpuEngine, kind: str, how: str) -> None:
+    inputs = scenes.random_scene(5, **KINDS[kind])
+    if how == "projected before":
+        inputs = projected(inputs)
+    expect_oracle(engine, inputs, None if how == "whole" else scenes.random_thresholds(5, 60))
 
 
 @pytest.mark.parametrize("stop", [None, 1e-4, 0.011, 1.0])

@@ -6,8 +6,7 @@ whose fragment counts differ by rounding are few and left out.
 
 import math
 from dataclasses import replace
-from inspect import signature
-from typing import Any, get_args
+from typing import get_args
 
 import pytest
 import scenes
@@ -21,72 +20,45 @@ from native.test_against_oracle import (
     draw_pair,
     expect_oracle,
     gradients,
+    projected,
 )
 
 from fragprune_plugins.engines.cpu.engine import CpuEngine
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.types import Compensation, RasterInputs, Rim
 
-ALONE = {
-    "mip": {"compensation": "mip", "dilation": 0.1},
-    "near": {"near": 2.5},
-    "scores": {"scores": True},
-    "offsets": {"offsets": True},
-    "absolute gradient": {"absolute_gradient": True},
-    "low cap": {"alpha_max": 0.5},
-    "capped gradient": {"alpha_max": 0.6, "cap_gradient": False},
-    "no cap": {"alpha_max": 1.0, "cap_gradient": False},
-    "1 feature": {"features": 1},
-    "8 features": {"features": 8},
-    "stopped, with features and scores": {"stop": 0.2, "features": 2, "scores": True},
-    "soft rim": {"rim": "soft", "offsets": True, "absolute_gradient": True},
-    "soft rim, with a capped gradient": {"rim": "soft", "alpha_max": 0.6, "cap_gradient": False},
-    "features, colours, offsets": {"features": 3, "colors": True, "offsets": True},
-}
-
-
-def dialect(seed: int, n: int = 60, width: int = 41, height: int = 29, **kind) -> RasterInputs:
-    """A random scene; what is not one of its own options is set on the inputs."""
-    given = {k: kind.pop(k) for k in signature(scenes.random_scene).parameters.keys() & kind}
-    return replace(scenes.random_scene(seed, n, width, height, **given), **kind)
-
-
-def flat(inputs: RasterInputs) -> RasterInputs:
-    """The same as footprints of float32, projected in float64."""
-    return scenes.cast(scenes.footprints_of(scenes.cast(inputs, torch.float64)), torch.float32)
-
-
 Case = tuple[RasterInputs, torch.Tensor | None]
 
 
 @st.composite
-def cases(draw: st.DrawFn, kind: dict[str, Any]) -> Case:
-    """Scenes of one kind, as splats or footprints, some truncated; sizes are no tiles."""
-    seed, n = draw(st.integers(0, 2**20)), draw(st.sampled_from([0, 1, 2, 9, 40]))
-    inputs = dialect(seed, n, *draw(st.sampled_from([(1, 1), (7, 33), (17, 15), (35, 21)])), **kind)
+def dialects(draw: st.DrawFn) -> Case:
+    """Everything mixed: splats or footprints, some truncated; sizes are no tiles."""
+    one_of = lambda *values: draw(st.sampled_from(values))  # noqa: E731
+    seed, n = draw(st.integers(0, 2**20)), one_of(0, 1, 2, 9, 40)
+    width, height = one_of((1, 1), (7, 33), (17, 15), (35, 21))
+    switches = ("offsets", "cap_gradient", "absolute_gradient", "scores", "colors", "cov3d")
+    inputs = scenes.random_scene(
+        seed,
+        n,
+        width,
+        height,
+        features=one_of(0, 1, 2, 3, 8),
+        compensation=one_of(*get_args(Compensation)),
+        dilation=one_of(0.05, 0.1, 0.3),
+        near=one_of(0.05, 0.2, 2.0),
+        alpha_max=one_of(0.7, 0.99, 0.999),
+        stop=one_of(None, 0.01, 0.5),
+        rim=one_of(*get_args(Rim)),
+        **{name: draw(st.booleans()) for name in switches},
+    )
     if draw(st.booleans()):
-        inputs = flat(inputs)
+        inputs = projected(inputs)
     return inputs, scenes.random_thresholds(seed, n) if draw(st.booleans()) else None
 
 
-@st.composite
-def dialects(draw: st.DrawFn) -> Case:
-    """Everything mixed."""
-    one_of = lambda *values: draw(st.sampled_from(values))  # noqa: E731
-    kind = {
-        "features": one_of(0, 1, 2, 3, 8),
-        "compensation": one_of(*get_args(Compensation)),
-        "dilation": one_of(0.05, 0.1, 0.3),
-        "near": one_of(0.05, 0.2, 2.0),
-        "alpha_max": one_of(0.7, 0.99, 0.999),
-        "stop": one_of(None, 0.01, 0.5),
-        "rim": one_of(*get_args(Rim)),
-    }
-    switches = ("offsets", "cap_gradient", "absolute_gradient", "scores", "colors", "cov3d")
-    return draw(cases(kind | {name: draw(st.booleans()) for name in switches}))
-
-
-def check_case(engine: CpuEngine, case: Case) -> None:
+@settings(max_examples=60)
+@given(case=dialects())
+def test_all_mixed_equal_the_oracle(engine: CpuEngine, case: Case) -> None:
     inputs, thresholds = case
     truth, ours, same = draw_pair(engine, inputs, thresholds)
     if not torch.equal(truth.radii, ours.radii):
@@ -97,33 +69,6 @@ def check_case(engine: CpuEngine, case: Case) -> None:
     check_gradients(engine, inputs, thresholds, same, 1e-2)
     if inputs.scores:
         check_scores(truth, ours, same)
-
-
-@pytest.mark.parametrize("kind", ALONE)
-@settings(max_examples=6)
-@given(data=st.data())
-def test_each_alone_equals_the_oracle(engine: CpuEngine, kind: str, data: st.DataObject) -> None:
-    check_case(engine, data.draw(cases(ALONE[kind])))
-
-
-@settings(max_examples=30)
-@given(case=dialects())
-def test_all_mixed_equal_the_oracle(engine: CpuEngine, case: Case) -> None:
-    check_case(engine, case)
-
-
-SURFELS = {
-    f"surfels, {name}": {**ALONE[name], "flat": True}
-    for name in ("near", "scores", "low cap", "capped gradient")
-} | {"surfels, stopped, scores": {"flat": True, "stop": 0.2, "scores": True}}
-LARGER = ALONE | SURFELS
-
-
-@pytest.mark.parametrize("kind", LARGER)
-def test_larger_scenes_equal_the_oracle_closely(engine: CpuEngine, kind: str) -> None:
-    inputs, thresholds = dialect(5, **LARGER[kind]), scenes.random_thresholds(5, 60)
-    for case in (inputs,) if kind in SURFELS else (inputs, flat(inputs)):
-        expect_oracle(engine, case, thresholds)
 
 
 def test_scores_and_features_change_nothing_else(engine: CpuEngine) -> None:
@@ -157,7 +102,7 @@ def test_features_without_a_gradient_from_above_get_zeros(engine: CpuEngine) -> 
 @pytest.mark.parametrize("kind", [{}, {"compensation": "mip"}, {"features": 2, "offsets": True}])
 def test_footprints_draw_and_learn_what_the_splats_do(engine: CpuEngine, kind: dict) -> None:
     """Projected in torch, drawn by the engine, and back through both."""
-    inputs = replace(dialect(2, **kind), absolute_gradient=True)
+    inputs = scenes.random_scene(2, **kind, absolute_gradient=True)
     thresholds = scenes.random_thresholds(2, 60)
     whole = engine.rasterize(replace(inputs, counts=True), thresholds)
     found = []
@@ -196,22 +141,6 @@ def test_footprints_that_cannot_be_drawn_are_culled(engine: CpuEngine) -> None:
     for name in ("means2d", "conics", "opacities", "colors"):
         assert not leaves[name].grad[:7].any(), name
         assert leaves[name].grad.isfinite().all(), name
-
-
-def test_a_broken_feature_takes_only_its_gaussian_along(engine: CpuEngine) -> None:
-    inputs = scenes.random_scene(1, 40, features=2)
-    inputs.splats.features[7, 1] = math.nan
-    opacities = inputs.splats.opacities.clone()
-    opacities[7] = 0.0
-    absent = replace(
-        inputs,
-        splats=replace(
-            inputs.splats, opacities=opacities, features=inputs.splats.features.nan_to_num()
-        ),
-    )
-    found, expected = engine.rasterize(inputs, None), engine.rasterize(absent, None)
-    assert torch.equal(found.image, expected.image)
-    assert torch.equal(found.features, expected.features)
 
 
 def test_offsets_beyond_all_bounds_are_refused(engine: CpuEngine) -> None:

@@ -42,9 +42,9 @@ NO_INPUTS = {"view", "splats", "means2d_hook", "counts", "scores", "planes"}
 """Fields that hold others, whose values are not used, or that say what comes back."""
 
 
-def values(inputs: RasterInputs, thresholds: torch.Tensor | None = THRESHOLDS) -> dict[str, Any]:
+def values(inputs: RasterInputs) -> dict[str, Any]:
     """What the struct says, and what is where it points."""
-    arrays = native_arrays(inputs, thresholds)
+    arrays = native_arrays(inputs, THRESHOLDS)
     struct = native_inputs(inputs, arrays, widen=False)
     found: dict[str, Any] = {}
     for name, kind in binding.Inputs._fields_:
@@ -130,11 +130,6 @@ def test_coefficients_in_two_arrays_are_drawn_and_learned_as_those_in_one(
     assert torch.allclose(images[1], expected, atol=1e-5)
 
 
-def test_thresholds_reach_compiled_code() -> None:
-    assert values(WORLD)["thresholds"] == THRESHOLDS.tolist()
-    assert values(WORLD, None)["thresholds"] is None
-
-
 def test_a_struct_has_no_fields_that_c_does_not_know() -> None:
     with pytest.raises(TypeError, match="gamma"):
         binding.Inputs(width=3, gamma=2.2)
@@ -173,11 +168,6 @@ def test_a_number_that_cannot_be_is_refused(
     status, message = draw(library, inputs)
     assert status != binding.OK
     assert message.startswith(said)
-
-
-@pytest.fixture(params=binding.usable_builds(), scope="module")
-def library(request: pytest.FixtureRequest) -> binding.Library:
-    return binding.open_build(request.param)
 
 
 @pytest.mark.parametrize("kind", GIVEN)

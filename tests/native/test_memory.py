@@ -6,8 +6,6 @@ import sys
 
 import pytest
 
-from fragprune_plugins.engines.cpu import binding
-
 STEPS = """
 import ctypes, resource, sys
 from fragprune_plugins.engines.cpu.memory import keep_freed_memory
@@ -52,9 +50,8 @@ def test_blocks_of_more_than_32_mib_go_back_where_a_model_grows() -> None:
 
 @pytest.mark.timeout(20)
 @pytest.mark.parametrize("size", [2**62, 2**63 + 1, 2**64 - 1])
-@pytest.mark.parametrize("build", binding.usable_builds())
-def test_memory_that_nobody_has_is_refused(build, size):
-    calls = binding.open_build(build).calls
+def test_memory_that_nobody_has_is_refused(library, size):
+    calls = library.calls
     workspace = calls.fragprune_workspace_new()
     try:
         assert not calls.fragprune_workspace_take(workspace, size)
