@@ -15,9 +15,7 @@ from fragprune_plugins.constants import NEUTRAL_LOGIT, TILE
 from fragprune_plugins.engines.reference import ReferenceEngine, camera_of, gaussians_of, options_of
 from fragprune_plugins.types import Footprints, RasterInputs, Splats, View
 from reference_renderer import project
-from reference_renderer.covariance import rotation_matrices
-
-AnySplats = Splats | Footprints
+from reference_renderer.covariance import covariances, rotation_matrices
 
 SH_DC = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 sqrt(pi))."""
@@ -172,18 +170,14 @@ def stack(
         )
         for i, opacity in enumerate(opacities)
     ]
-    joined = layers[0].splats
-    for layer in layers[1:]:
-        joined = concatenate(joined, layer.splats)
-    return replace(layers[0], splats=joined)
+    return replace(layers[0], splats=concatenate([layer.splats for layer in layers]))
 
 
 def behind_camera(*, dtype: torch.dtype = torch.float32) -> RasterInputs:
     """Three splats that the near plane culls (z = -2, 0.1, exactly 0); nothing is drawn."""
     scene = one_splat(background=(0.1, 0.2, 0.3), dtype=torch.float64)
     means = torch.tensor([[0.0, 0.0, -2.0], [0.0, 0.0, 0.1], [0.1, 0.0, 0.0]], dtype=torch.float64)
-    splats = concatenate(concatenate(scene.splats, scene.splats), scene.splats)
-    assert isinstance(splats, Splats)
+    splats = concatenate([scene.splats] * 3)
     return cast(replace(scene, splats=replace(splats, means=means)), dtype)
 
 
@@ -221,7 +215,7 @@ def cast(
 ) -> RasterInputs:
     """The same inputs in another dtype, on another device."""
 
-    def convert(value: View | AnySplats | RasterInputs) -> dict[str, Any]:
+    def convert(value: View | Splats | Footprints | RasterInputs) -> dict[str, Any]:
         return {
             name: tensor.to(device, dtype if tensor.is_floating_point() else None).contiguous()
             for name, tensor in _tensors(value).items()
@@ -235,29 +229,22 @@ def cast(
     )
 
 
-def concatenate(first: AnySplats, second: AnySplats) -> AnySplats:
-    """Concatenate two sets, the first one's rows first; both must have the same kind and fields."""
-    others = _tensors(second)
-    joined: dict[str, Any] = {
-        name: torch.cat([t, others[name]]) for name, t in _tensors(first).items()
-    }
-    return replace(first, **joined)
+def concatenate(parts: list[Splats]) -> Splats:
+    """All rows of several sets, the first one's first; all must have the same fields."""
+    tensors = [_tensors(part) for part in parts]
+    return replace(parts[0], **{k: torch.cat([each[k] for each in tensors]) for k in tensors[0]})
 
 
 def with_cov3d(splats: Splats) -> Splats:
     """The same Gaussians given by 3D covariances instead of scales and rotations."""
-    if splats.scales is None or splats.rotations is None:
-        return splats
-    rotation = rotation_matrices(splats.rotations)
-    half = rotation * splats.scales[:, None, :]
-    full = half @ half.mT
+    full = covariances(gaussians_of(splats), 1.0)
     i, j = torch.triu_indices(3, 3)
     return replace(splats, scales=None, rotations=None, cov3d=full[:, i, j])
 
 
 def random_view(generator: torch.Generator, width: int, height: int) -> View:
     """A camera turned and moved at random, focal lengths unequal, background not black; float64."""
-    rotation = _rotation_matrix(_rotations(generator, 1)[0])
+    rotation = rotation_matrices(_rotations(generator, 1))[0]
     translation = torch.randn(3, generator=generator, dtype=torch.float64)
     fx, fy = _uniform(generator, 0.8, 1.3, 2).tolist()
     return View.pinhole(
@@ -328,20 +315,12 @@ def _rotations(generator: torch.Generator, n: int) -> Tensor:
     return torch.nn.functional.normalize(quaternions, dim=-1)
 
 
-def _rotation_matrix(quaternion: Tensor) -> Tensor:
-    """(3, 3) rotation of a unit quaternion (4,): the vector part's exponential."""
-    w, x, y, z = quaternion.tolist()
-    cross = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64)
-    turn: Tensor = torch.eye(3, dtype=torch.float64) + 2 * w * cross + 2 * cross @ cross
-    return turn
-
-
 def _uniform(generator: torch.Generator, low: float, high: float, *shape: int) -> Tensor:
     """Uniform float64 numbers in [low, high)."""
     return torch.rand(*shape, generator=generator, dtype=torch.float64) * (high - low) + low
 
 
-def _tensors(value: View | AnySplats | RasterInputs) -> dict[str, Any]:
+def _tensors(value: View | Splats | Footprints | RasterInputs) -> dict[str, Any]:
     """The dataclass's fields that are tensors, by name."""
     pairs = ((f.name, getattr(value, f.name)) for f in fields(value))
     return {name: tensor for name, tensor in pairs if isinstance(tensor, Tensor)}

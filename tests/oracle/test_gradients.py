@@ -43,8 +43,34 @@ def smooth_scene(n=3, **kind):
     return replace(made, splats=splats)
 
 
+def smooth_surfels(**kind):
+    """Surfels inside a small image, none capped or culled, their centres between pixels.
+
+    So no pixel is nearer to a round Gaussian than to a plane, where depths have other derivatives.
+    """
+    made = scenes.random_scene(7, 3, 9, 7, dtype=F64, **kind)
+    view = scenes.one_splat(width=9, height=7, dtype=F64).view  # the world is the camera's
+    at = torch.tensor([[2.27, 3.69], [5.2, 1.88], [3.62, 5.03]], dtype=F64)
+    depths = torch.tensor([2.0, 3.0, 4.0], dtype=F64)
+    per_pixel = depths * 2 * view.tan_fov_x / 9
+    turns = torch.tensor([[1, 0.1, 0.05, 0.3], [1, -0.1, 0.1, 0], [0.9, 0.1, -0.1, 0.6]], dtype=F64)
+    splats = replace(
+        made.splats,
+        means=scenes.unproject(view, at, depths),
+        opacities=torch.tensor([0.5, 0.8, 0.3], dtype=F64),
+        scales=torch.tensor([[1.6, 1.2], [1.2, 1.8], [1.5, 1.5]], dtype=F64)
+        * per_pixel[:, None]
+        / made.scale_modifier,
+        rotations=torch.nn.functional.normalize(turns),
+    )
+    if splats.sh is not None:
+        splats = replace(splats, sh=splats.sh * 0.2)
+    return replace(made, view=view, splats=splats)
+
+
 def outputs(drawn):
-    made = drawn.image, drawn.invdepth, drawn.alpha, drawn.fragments_per_pixel, drawn.features
+    made = drawn.image, drawn.invdepth, drawn.alpha, drawn.fragments_per_pixel
+    made = (*made, drawn.features, drawn.surface)
     return tuple(tensor for tensor in made if tensor is not None)
 
 
@@ -58,6 +84,8 @@ KINDS = {
     "mip, covariances": {"cov3d": True, "compensation": "mip", "sh_degree": 0},
     "features at offsets": {"colors": True, "features": 3, "offsets": True},
     "scaled": {"colors": True, "scale_modifier": 1.3},
+    "surfels": {"colors": True, "flat": True},
+    "surfels, sh, scaled": {"sh_degree": 2, "scale_modifier": 1.3, "flat": True},
 }
 
 
@@ -66,11 +94,12 @@ KINDS = {
     [
         *((kind, "surrogate") for kind in KINDS),
         *((kind, "soft") for kind in ("sh degree 1", "mip, covariances", "features at offsets")),
-        *((kind, None) for kind in ("sh degree 3", "antialiased", "scaled")),
+        *((kind, None) for kind in ("sh degree 3", "antialiased", "scaled", "surfels")),
     ],
 )
 def test_every_input_has_the_derivative_of_finite_differences(kind, rim):
-    scene, leaves = scenes.leaves(smooth_scene(**KINDS[kind]))
+    smooth = smooth_surfels if "flat" in KINDS[kind] else smooth_scene
+    scene, leaves = scenes.leaves(smooth(**KINDS[kind]))
     truncated, options = rim is not None, replace(uncut(scene), rim=rim or "hard")
     hook = leaves.pop("means2d_hook")
     names = list(leaves)

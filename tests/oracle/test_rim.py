@@ -8,7 +8,6 @@ import scenes
 import torch
 
 from fragprune_plugins import rasterize
-from fragprune_plugins.errors import InputError
 
 F64 = torch.float64
 SIZE = 33
@@ -69,10 +68,3 @@ def test_the_counts_gradient_is_that_of_the_covered_area():
     rasterize(inputs, given, engine="reference").fragments_per_pixel.backward()
     area_by_tau = -2 * math.pi * spread / tau  # of pi spread (-2 ln tau)
     assert given.grad.item() * SIZE**2 == pytest.approx(area_by_tau, rel=0.03)
-
-
-def test_a_rim_is_hard_or_soft_and_of_surfels_hard():
-    with pytest.raises(InputError, match=r"rim.*hard.*soft"):
-        replace(scenes.one_splat(), rim="round")
-    with pytest.raises(InputError, match=r"surfels.*soft rim"):
-        scenes.random_scene(0, 3, flat=True, rim="soft")

@@ -44,19 +44,16 @@ def test_only_torch_and_the_standard_library_are_imported():
 
 def test_its_own_constants_are_those_of_the_core():
     defaults = Options()
-    assert defaults.dilation == constants.DILATION
-    assert defaults.near == constants.NEAR
-    assert defaults.alpha_min == constants.ALPHA_MIN
-    assert defaults.alpha_max == constants.ALPHA_MAX
-    assert defaults.transmittance_min == constants.TRANSMITTANCE_MIN
-    assert scene.RIM_WIDTH == constants.RIM_WIDTH
-    assert scene.RIM_REACH == constants.RIM_REACH
-    assert scene.FALLOFF_MIN == constants.FALLOFF_MIN
-    assert covariance.FRUSTUM_MARGIN == constants.FRUSTUM_MARGIN
-    assert project.TILE == constants.TILE
-    assert project.ANTIALIASING_FLOOR == constants.ANTIALIASING_FLOOR
-    assert project.MIP_FLOOR == constants.MIP_FLOOR
     assert 1 / defaults.alpha_min == 255
+    for name in ("DILATION", "NEAR", "ALPHA_MIN", "ALPHA_MAX", "TRANSMITTANCE_MIN"):
+        assert getattr(defaults, name.lower()) == getattr(constants, name), name
+    for module, names in (
+        (scene, ("RIM_WIDTH", "RIM_REACH", "FALLOFF_MIN")),
+        (covariance, ("FRUSTUM_MARGIN",)),
+        (project, ("TILE", "ANTIALIASING_FLOOR", "MIP_FLOOR")),
+    ):
+        for name in names:
+            assert getattr(module, name) == getattr(constants, name), name
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
@@ -252,23 +249,26 @@ def test_footprints_that_cannot_be_drawn_are_culled():
 
 
 @pytest.mark.parametrize(
-    "change",
+    ("change", "said"),
     [
-        {"near": -1.0},
-        {"near": math.nan},
-        {"alpha_max": 1.1},
-        {"stop": 0.0},
-        {"stop": 1.5},
-        {"stop": math.nan},
-        {"stop": 0.01, "alpha_max": 1.0},
-        {"compensation": "some"},
-        {"sample_offsets": torch.zeros(17, 16, 2)},
-        {"absolute_gradient": True, "means2d_hook": torch.zeros(1, 2)},
+        *(({"near": near}, "near") for near in (-1.0, math.nan)),
+        ({"alpha_max": 1.1}, "alpha_max"),
+        *(({"stop": stop}, "stop") for stop in (0.0, 1.5, math.nan)),
+        ({"stop": 0.01, "alpha_max": 1.0}, "alpha_max"),
+        ({"compensation": "some"}, "compensation"),
+        ({"rim": "round"}, "rim.*hard.*soft"),
+        ({"planes": ("depth",)}, "planes"),
+        ({"absolute_gradient": True, "means2d_hook": torch.zeros(40, 2)}, "means2d_hook"),
+        ({"flat": True, "compensation": "mip"}, "surfels .* with compensation"),
+        ({"flat": True, "absolute_gradient": True}, "surfels .* with absolute_gradient"),
+        ({"flat": True, "offsets": True}, "surfels .* with sample_offsets"),
+        ({"flat": True, "features": 2}, "with features"),
+        ({"flat": True, "rim": "soft"}, "surfels.*soft rim"),
     ],
 )
-def test_inputs_of_no_dialect_are_refused(change):
-    with pytest.raises(InputError):
-        replace(scenes.one_splat(), **change)
+def test_inputs_of_no_dialect_are_refused(change, said):
+    with pytest.raises(InputError, match=said):
+        scenes.random_scene(1, 40, **change)
 
 
 @pytest.mark.parametrize("channels", [0, 9])

@@ -9,9 +9,9 @@ import pytest
 import scenes
 import torch
 from oracle.naive import color_of, rotate
+from oracle.test_gradients import smooth_surfels, uncut
 
-from fragprune_plugins.engines.reference import ReferenceEngine, camera_of, gaussians_of, options_of
-from fragprune_plugins.errors import InputError
+from fragprune_plugins.engines.reference import ReferenceEngine, camera_of, gaussians_of
 from reference_renderer import render
 from reference_renderer.surfel import meet
 
@@ -180,61 +180,9 @@ def test_a_threshold_draws_what_lies_within_its_radius_on_the_plane():
 # -- derivatives -----------------------------------------------------------------------------------
 
 
-def smooth(**kind):
-    """Surfels inside a small image, none capped or culled, their centres between pixels.
-
-    So no pixel is nearer to a round Gaussian than to a plane, where depths have other derivatives.
-    """
-    made = scenes.random_scene(7, 3, 9, 7, flat=True, dtype=F64, **kind)
-    view = scenes.one_splat(width=9, height=7, dtype=F64).view  # the world is the camera's
-    at = torch.tensor([[2.27, 3.69], [5.2, 1.88], [3.62, 5.03]], dtype=F64)
-    depths = torch.tensor([2.0, 3.0, 4.0], dtype=F64)
-    per_pixel = depths * 2 * view.tan_fov_x / 9
-    turns = torch.tensor([[1, 0.1, 0.05, 0.3], [1, -0.1, 0.1, 0], [0.9, 0.1, -0.1, 0.6]], dtype=F64)
-    splats = replace(
-        made.splats,
-        means=scenes.unproject(view, at, depths),
-        opacities=torch.tensor([0.5, 0.8, 0.3], dtype=F64),
-        scales=torch.tensor([[1.6, 1.2], [1.2, 1.8], [1.5, 1.5]], dtype=F64)
-        * per_pixel[:, None]
-        / made.scale_modifier,
-        rotations=torch.nn.functional.normalize(turns),
-    )
-    if splats.sh is not None:
-        splats = replace(splats, sh=splats.sh * 0.2)
-    return replace(made, view=view, splats=splats)
-
-
-def uncut(inputs):
-    options = options_of(inputs)
-    return replace(options, alpha_min=0, transmittance_min=0, tiles=False, rim="surrogate")
-
-
-@pytest.mark.parametrize("truncated", [True, False], ids=["thresholds", "none"])
-@pytest.mark.parametrize(
-    "kind", [{"colors": True}, {"sh_degree": 2, "scale_modifier": 1.3}], ids=str
-)
-def test_every_input_has_the_derivative_of_finite_differences(kind, truncated):
-    scene, leaves = scenes.leaves(smooth(**kind))
-    options = uncut(scene)
-    del leaves["means2d_hook"]
-    names = list(leaves)
-    tau = torch.tensor([0.3, 0.6, 0.1], dtype=F64, requires_grad=truncated)
-
-    def drawn(*tensors):
-        given = dict(zip(names, tensors[:-1], strict=True))
-        camera = replace(camera_of(scene), background=given.pop("background"))
-        gaussians = replace(gaussians_of(scene.splats), **given)
-        made = render(camera, gaussians, tensors[-1] if truncated else None, options=options)
-        parts = [made.image, made.alpha, made.invdepth, made.surface]
-        return (*parts, made.fragments_per_pixel) if truncated else tuple(parts)
-
-    assert torch.autograd.gradcheck(drawn, (*leaves.values(), tau), atol=1e-5, fast_mode=True)
-
-
 def test_the_hooks_gradient_is_the_means_along_the_screen():
     """Moving the plane by one pixel of its centre, in units of half a picture."""
-    scene, leaves = scenes.leaves(smooth(colors=True))
+    scene, leaves = scenes.leaves(smooth_surfels(colors=True, flat=True))
     options = uncut(scene)
     camera, gaussians = camera_of(scene), gaussians_of(scene.splats)
     drawn = render(camera, gaussians, means2d_hook=scene.means2d_hook, options=options)
@@ -258,26 +206,3 @@ def test_where_the_round_gaussian_is_nearer_depth_feels_the_plane_but_not_the_po
         assert bool(plane.grad[0, :2].any()) == moves
         assert plane.grad[0, 2, 2] == 1 or moves
     assert q.item() != filtered
-
-
-# -- what is refused -------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"compensation": "mip"},
-        {"absolute_gradient": True},
-        {"sample_offsets": torch.zeros(28, 40, 2)},
-    ],
-    ids=lambda change: next(iter(change)),
-)
-def test_what_its_rasterizer_does_not_know_is_refused(change):
-    scene = scenes.random_scene(1, 5, flat=True)
-    with pytest.raises(InputError, match=f"surfels .* with {next(iter(change))}"):
-        replace(scene, **change)
-
-
-def test_features_of_surfels_are_refused():
-    with pytest.raises(InputError, match="with features"):
-        scenes.random_scene(1, 5, flat=True, features=2)
