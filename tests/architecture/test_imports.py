@@ -20,9 +20,7 @@ from fragprune_plugins.workbench import bridge as bridge_command
 ROOT = Path(__file__).parents[2]
 ADAPTERS = sorted(p.name for p in (ROOT / "adapters").glob("fragprune_*") if p.is_dir())
 PACKAGES = ["fragprune_plugins", "reference_renderer", *ADAPTERS]
-HOST = (
-    ROOT / "fragprune_plugins" / "workbench" / "demo" / "host"
-)  # a program of its own, not our package
+HOST = ROOT / "fragprune_plugins" / "workbench" / "demo" / "host"  # a program of its own
 INSIDE = {  # run inside an installed host alone, which imports them
     "fragprune_nerfstudio.method": "nerfstudio",
     "fragprune_nerfstudio.model": "nerfstudio",

@@ -15,6 +15,8 @@ from pathlib import Path
 
 import pytest
 
+from fragprune_plugins.engines.cpu import binding
+
 ROOT = Path(__file__).parents[2]
 COMPILER = """#!/bin/sh
 all="$*"
@@ -63,7 +65,7 @@ def wheel(project: Path, **variables: str) -> tuple[str, dict[str, str]]:
 @pytest.mark.parametrize(
     ("platform", "tag", "builds"),
     [
-        ("linux-x86_64", "linux_x86_64", {"baseline", "avx2", "avx512"}),
+        ("linux-x86_64", "linux_x86_64", set(binding.BUILDS)),
         ("linux-aarch64", "linux_aarch64", {"baseline"}),
         ("macosx-11.0-arm64", "macosx_11_0_arm64", {"baseline"}),
     ],
@@ -71,9 +73,9 @@ def wheel(project: Path, **variables: str) -> tuple[str, dict[str, str]]:
 def test_a_wheel_fits_every_python_and_holds_what_its_platform_runs(project, platform, tag, builds):
     name, libraries = wheel(project, _PYTHON_HOST_PLATFORM=platform)
     assert name.endswith(f"-py3-none-{tag}.whl")
-    assert set(libraries) == {f"_cpu_{build}.so" for build in builds}
-    for build in builds:
-        assert ("-mavx2" in libraries[f"_cpu_{build}.so"]) == (build == "avx2")
+    assert set(libraries) == {f"_cpu_{build}{binding._SUFFIX}" for build in builds}
+    for library, arguments in libraries.items():
+        assert ("-mavx2" in arguments) == ("avx2" in library)
 
 
 def test_a_packager_adds_flags_and_this_python_adds_none(project):
@@ -83,6 +85,14 @@ def test_a_packager_adds_flags_and_this_python_adds_none(project):
         *("-g1", "-DNDEBUG", "-Wl,-z,now")
     ]
     assert not [word for word in said if word.startswith(("-I", "-L", "-l"))]
+
+
+def test_a_change_to_any_header_that_the_engine_includes_rebuilds_it(monkeypatch):
+    monkeypatch.chdir(ROOT)  # where its paths begin
+    shipped = runpy.run_path("setup.py")
+    text = "".join(path.read_text() for path in (shipped["SOURCE"], *shipped["HEADERS"]))
+    included = set(re.findall(r'^#include "(?:.*/)?(\w+\.h)"', text, re.MULTILINE))
+    assert included == {path.name for path in shipped["HEADERS"]}
 
 
 @pytest.mark.parametrize("compiler", ["false", "no-such-compiler"])
