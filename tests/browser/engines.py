@@ -89,10 +89,8 @@ class Page:
 
 
 @contextmanager
-def drawing(
-    browser: Any, engine: str, model: Path, view: View, *, errors: bool = False, **options: Any
-) -> Iterator[Page]:
-    """Open a page in which an engine has drawn a model.
+def drawing(browser: Any, engine: str, model: Path, view: View, **options: Any) -> Iterator[Page]:
+    """Open a page in which an engine has drawn a model, and expect no error of it.
 
     Args:
         browser: from ``chromium``.
@@ -100,7 +98,6 @@ def drawing(
             renderer that sorts on the CPU, or "spark".
         model: PLY, or what the engine reads besides.
         view: the camera; its principal point is the centre, and both focal lengths are equal.
-        errors: the page may report some; else they raise AssertionError.
         options: of ``playcanvas.js`` or ``spark.js``.
     """
     engine, *device = engine.split("-")
@@ -125,7 +122,7 @@ def drawing(
             imports = {name: f"./{path}" for name, path in MODULES.items()}
             tab.run("given => window.start(given)", [engine, imports, given])
             yield Page(tab, view)
-            assert errors or (tab.errors, tab.strangers) == ([], [])
+            assert tab.errors == tab.strangers == []
 
 
 def placed(view: View) -> list[float]:

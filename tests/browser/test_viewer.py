@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scenes
 import torch
 from browser.chromium import opened, served
 from browser.viewing import decibels, engine_frame, frame, hold, viewing, write_page
 from finetune import tiny
 
-from fragprune_plugins import Model, ThresholdStore, View, load_dataset
+from fragprune_plugins import Model, RasterInputs, ThresholdStore, View, load_dataset
 from fragprune_plugins.workbench.models import formats
 from fragprune_plugins.workbench.view.site import (
     Layer,
@@ -19,8 +20,6 @@ from fragprune_plugins.workbench.view.site import (
     save_site,
     single_page,
 )
-from reference_renderer import Camera, Gaussians, Options
-from reference_renderer.project import project
 
 pytestmark = pytest.mark.browser
 
@@ -72,28 +71,15 @@ def boxes(
 
     Shapes are boxes, or octagons around ellipses of more than ``large`` square pixels.
     """
-    splat = model.splats()
-    front = (model.xyz @ view.viewmatrix[:3, :3] + view.viewmatrix[3, :3])[:, 2] > 0.2
-    camera = Camera(**{name: getattr(view, name) for name in Camera.__dataclass_fields__})
-    gaussians = Gaussians(
-        means=splat.means.double(),
-        opacities=splat.opacities.double(),
-        scales=splat.scales.double(),
-        rotations=splat.rotations.double(),
-        sh=splat.sh.double(),
-        sh_degree=splat.sh_degree,
-    ).take(front.nonzero()[:, 0])
-    doubles = {
-        name: getattr(camera, name).double()
-        for name in ("viewmatrix", "projmatrix", "campos", "background")
-    }
-    found = project(Camera(**{**vars(camera), **doubles}), gaussians, Options())
-    cutoffs = 2 * np.log(255 * found.opacity.numpy())
+    inputs = scenes.cast(RasterInputs(view, model.splats()), torch.float64)
+    found = scenes.footprints_of(inputs).splats
+    cutoffs = 2 * torch.log(255 * found.opacities)  # behind the camera opacity is 0
     if truncated:
-        cutoffs = np.minimum(cutoffs, -2 * np.log(model.thresholds.values.detach()[front].numpy()))
+        cutoffs = torch.minimum(cutoffs, -2 * model.falloff.double().log())
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     quads, ellipses = np.zeros((2, HEIGHT, WIDTH))
-    for mean, conic, cutoff in zip(found.mean2d.numpy(), found.conic.numpy(), cutoffs, strict=True):
+    shapes = (found.means2d.numpy(), found.conics.numpy(), cutoffs.numpy())
+    for mean, conic, cutoff in zip(*shapes, strict=True):
         if cutoff < 0:
             continue
         precision, axes = np.linalg.eigh([[conic[0], conic[1]], [conic[1], conic[2]]])
