@@ -3,28 +3,21 @@
 import random
 
 import pytest
-from native.sanitize import building
-from native.sanitize.building import MEMORY, Toolchain
+from native.sanitize.building import MEMORY
 
 pytestmark = pytest.mark.slow
+TARGET = "fuzz/fuzz_target.cpp", "baseline", MEMORY
 
 
-def test_any_bytes_are_survived(toolchain: Toolchain) -> None:
-    before = building.wrapper(toolchain, MEMORY)
-    program = toolchain.program("fuzz/fuzz_target.cpp", "baseline", MEMORY)
-    limits = ["--inputs", "1000", "--seconds", "20"]
-    tally = building.run([*before, str(program), *limits], toolchain.folder)
+def test_any_bytes_are_survived(toolchain):
+    tally = toolchain.tally(*TARGET, "--inputs", 1000, "--seconds", 20)
     for kind in ("calls", "drew", "backward", "refused"):
         assert tally[kind] > 20, kind
 
 
-def test_inputs_on_disk_are_replayed(toolchain: Toolchain) -> None:
-    before = building.wrapper(toolchain, MEMORY)
-    program = toolchain.program("fuzz/fuzz_target.cpp", "baseline", MEMORY)
-    files = []
-    for size in (0, 1, 3, 64, 5000):
-        file = toolchain.folder / f"input_{size}.bin"
+def test_inputs_on_disk_are_replayed(toolchain):
+    sizes = (0, 1, 3, 64, 5000)
+    files = [toolchain.folder / f"input_{size}.bin" for size in sizes]
+    for file, size in zip(files, sizes, strict=True):
         file.write_bytes(random.Random(size).randbytes(size))
-        files.append(str(file))
-    tally = building.run([*before, str(program), *files], toolchain.folder)
-    assert tally["calls"] == len(files)
+    assert toolchain.tally(*TARGET, *files)["calls"] == len(files)

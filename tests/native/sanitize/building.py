@@ -6,8 +6,7 @@ import shlex
 import shutil
 import subprocess
 from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -46,52 +45,37 @@ def shipped_flags(build: str) -> tuple[str, list[str]]:
 
 @dataclass
 class Toolchain:
-    """A compiler and a folder; each object is compiled once.
+    """A compiler and a folder for what it makes.
 
     Attributes:
         compiler: the command and its first arguments.
-        folder: where objects and programs go.
+        folder: where programs go.
         plain: flags of everything.
     """
 
     compiler: list[str]
     folder: Path
     plain: Sequence[str] = PLAIN
-    _objects: dict[tuple[str, ...], Future[Path]] = field(default_factory=dict)
-    _pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(2))
-
-    def engine(self, build: str, sanitizers: tuple[str, ...]) -> Future[Path]:
-        """Start compiling the engine."""
-        source, flags = shipped_flags(build)
-        return self._object(source, *flags, *sanitizers)
 
     def program(self, source: str, build: str, sanitizers: tuple[str, ...]) -> Path:
-        """Link one of the tests' programs with the engine."""
-        include = f"-I{ROOT / 'fragprune_plugins/native/include'}"
-        flags = ["-std=c++17", include, f"-I{TESTS / 'sanitize'}"]
-        pending = [
-            self.engine(build, sanitizers),
-            self._object(str(TESTS / source), *flags, *sanitizers),
-        ]
-        objects = [str(job.result()) for job in pending]
-        made = self.folder / f"{Path(source).stem}_{len(list(self.folder.iterdir()))}"
-        self._compile(*objects, "-pthread", *sanitizers, "-o", str(made))
+        """One of the tests' programs with the engine, compiled once."""
+        engine, flags = shipped_flags(build)
+        made = self.folder / "-".join([Path(source).stem, build, *sanitizers])
+        if not made.exists():
+            include = ROOT / "fragprune_plugins/native/include"
+            command = [*self.compiler, *flags, *self.plain, *sanitizers, engine, TESTS / source]
+            command += [f"-I{include}", f"-I{TESTS / 'sanitize'}", "-pthread", "-o", made]
+            done = subprocess.run(command, capture_output=True, text=True, timeout=240)
+            assert done.returncode == 0, done.stderr[-4000:]
         return made
 
-    def _object(self, source: str, *flags: str) -> Future[Path]:
-        key = (source, *flags)
-        if key not in self._objects:
-            made = self.folder / f"{len(self._objects)}.o"
-            command = [*flags, "-pthread", "-c", source, "-o", str(made)]
-            self._objects[key] = self._pool.submit(self._compile, *command, gives=made)
-        return self._objects[key]
-
-    def _compile(self, *arguments: str, gives: Path | None = None) -> Path | None:
-        done = subprocess.run(
-            [*self.compiler, *self.plain, *arguments], capture_output=True, text=True, timeout=240
-        )
-        assert done.returncode == 0, done.stderr[-4000:]
-        return gives
+    def tally(
+        self, source: str, build: str, sanitizers: tuple[str, ...], *words: object
+    ) -> dict[str, int]:
+        """What such a program prints in the end; skips where none with these sanitizers runs."""
+        before = wrapper(self, sanitizers)
+        program = self.program(source, build, sanitizers)
+        return run([*before, str(program), *map(str, words)], self.folder)
 
 
 def find_compiler() -> list[str] | None:

@@ -5,28 +5,21 @@ the seed in hand. For a longer run see docs/how-to/sanitize.md.
 """
 
 import pytest
-from native.sanitize import building
-from native.sanitize.building import MEMORY, THREADS, Toolchain
+from native.sanitize.building import MEMORY, THREADS, builds
+
+pytestmark = pytest.mark.slow
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("build", building.builds())
-def test_no_access_out_of_bounds_no_leak_nothing_undefined(
-    toolchain: Toolchain, build: str
-) -> None:
-    before = building.wrapper(toolchain, MEMORY)
-    program = toolchain.program("sanitize/driver.cpp", build, MEMORY)
-    tally = building.run([*before, str(program), "0", "1500"], toolchain.folder)
+@pytest.mark.parametrize("build", builds())
+def test_no_access_out_of_bounds_no_leak_nothing_undefined(toolchain, build):
+    tally = toolchain.tally("sanitize/driver.cpp", build, MEMORY, 0, 1500)
     assert tally["calls"] == 1500
     # The dice left nothing out: an engine that draws nothing would pass without a word.
     for kind in ("drew", "poisoned", "backward", "refused", "empty", "cut", "present", "losses"):
         assert tally[kind] > 50, kind
 
 
-@pytest.mark.slow
-def test_no_race(toolchain: Toolchain) -> None:
-    before = building.wrapper(toolchain, THREADS)
-    program = toolchain.program("sanitize/driver.cpp", "baseline", THREADS)
-    tally = building.run([*before, str(program), "0", "400"], toolchain.folder)
+def test_no_race(toolchain):
+    tally = toolchain.tally("sanitize/driver.cpp", "baseline", THREADS, 0, 400)
     assert tally["drew"] > 100
     assert tally["backward"] > 100
