@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -42,3 +43,14 @@ def kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty folder for compiled kernels."""
     monkeypatch.setenv(kernels.CACHE, str(tmp_path / "kept"))
     return tmp_path / "kept"
+
+
+@pytest.fixture(scope="session")
+def nvrtc() -> kernels.Nvrtc:
+    """The development extra brings it on Linux: there, its absence is a failure."""
+    try:
+        return kernels.Nvrtc()
+    except kernels.Unavailable as why:
+        if sys.platform.startswith("linux"):
+            raise
+        pytest.skip(str(why))

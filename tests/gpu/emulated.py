@@ -1,7 +1,11 @@
-"""The emulation of a GPU with kernels of the tests' own."""
+"""The emulation of a GPU with kernels of the tests' own, or with somebody who tampers with it."""
 
 import ctypes
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+
+import torch
 
 from fragprune_plugins.workbench.doctor.emulated import EmulatedDevice
 
@@ -20,3 +24,24 @@ class Numbers(ctypes.Structure):
     """What the kernels of broken.cu take."""
 
     _fields_ = (("to", ctypes.c_void_p),)
+
+
+@dataclass(eq=False)  # a device is one by itself
+class Watched:
+    """The emulation, and somebody who looks at, or tampers with, what its kernels did.
+
+    Attributes:
+        device: the emulation.
+        after: called after each launch, with the kernel's name and arguments.
+    """
+
+    device: EmulatedDevice
+    after: Callable[[str, ctypes.Structure], None]
+    kind = "cpu"
+
+    def launch(self, where, source, macros, kernel, blocks, arguments) -> None:
+        self.device.launch(where, source, macros, kernel, blocks, arguments)
+        self.after(kernel, arguments)
+
+    def capturing(self, where: torch.device) -> bool:
+        return False

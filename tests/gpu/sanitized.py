@@ -18,14 +18,14 @@ import scenes
 import torch
 from gpu.emulated import BrokenDevice, Numbers
 from native.test_invariants import everything
-from spacetime import cut, moment, splats
+from spacetime import KINDS, cut, gradients, leaves, moment, splats
 
 from fragprune_plugins.engines.cuda import frame
 from fragprune_plugins.engines.cuda.engine import CudaEngine
 from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.doctor.emulated import EmulatedDevice
 
-KINDS = {
+SANITIZERS = {
     "thread": (
         ("-fsanitize=thread", "--param=tsan-distinguish-volatile=1"),
         "libtsan.so",
@@ -54,7 +54,7 @@ DIALECTS = (
 
 def library(compiler: str, kind: str) -> str | None:
     """A sanitizer's own, where the compiler has one."""
-    command = [compiler, f"-print-file-name={KINDS[kind][1]}"]
+    command = [compiler, f"-print-file-name={SANITIZERS[kind][1]}"]
     said = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
     return said if Path(said).is_file() else None
 
@@ -103,12 +103,8 @@ def draw(device: EmulatedDevice, seed: int) -> None:
     engine.capacity = 7
     engine.rasterize(scenes.random_scene(seed, 300, 330, 290, scale_modifier=3.0), None)
     engine.rasterize(scenes.empty(), None)
-    given = splats(("joint", "apart", "still", "sliced")[seed % 4], 300)
-    leaves = {k: t for k, t in vars(given).items() if isinstance(t, torch.Tensor)}
-    for leaf in leaves.values():
-        leaf.requires_grad_()
-    result = cut(engine, given, moment(1))
-    (result.means.sum() + result.cov3d.sum() + result.opacities.sum()).backward()
+    given = leaves(splats(KINDS[seed % len(KINDS)], 300), torch.float32)
+    gradients(given, cut(engine, given, moment(1)))
 
 
 def run_broken(device: EmulatedDevice, kernel: str) -> None:
@@ -121,14 +117,14 @@ def run_broken(device: EmulatedDevice, kernel: str) -> None:
 def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(prog="python -m gpu.sanitized", description=__doc__)
-    parser.add_argument("kind", choices=KINDS)
+    parser.add_argument("kind", choices=SANITIZERS)
     parser.add_argument("--resident", type=int, default=3, help="blocks under way at a time")
     parser.add_argument("--first", type=int, default=0, help="seed")
     parser.add_argument("--seeds", type=int, default=len(DIALECTS))
     parser.add_argument("--broken", help="a kernel of broken.cu instead")
     parser.add_argument("--compiler", default=os.environ.get("CXX", "g++"))
     asked = parser.parse_args()
-    flags, _, options = KINDS[asked.kind]
+    flags, _, options = SANITIZERS[asked.kind]
     if "FRAGPRUNE_SANITIZED" not in os.environ:  # again, with the sanitizer loaded first
         preload = library(asked.compiler, asked.kind)
         if preload is None:

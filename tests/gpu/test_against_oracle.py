@@ -28,7 +28,6 @@ from fragprune_plugins.engines.cuda import engine as cuda
 from fragprune_plugins.engines.cuda import frame
 from fragprune_plugins.engines.cuda.engine import CudaEngine
 from fragprune_plugins.errors import EngineError, InputError
-from fragprune_plugins.workbench.doctor.emulated import EmulatedDevice
 
 # those of the cpu engine, over this one
 __all__ = [
@@ -46,39 +45,35 @@ KINDS = [
 
 
 @pytest.mark.parametrize(("kind", "truncated"), [("plain", False), *((k, True) for k in KINDS)])
-def test_images_and_gradients_equal_the_oracle(
-    engine: CudaEngine, kind: str, truncated: bool
-) -> None:
+def test_images_and_gradients_equal_the_oracle(engine, kind, truncated):
     inputs = scenes.random_scene(1, **native.KINDS[kind])
     expect_oracle(engine, inputs, scenes.random_thresholds(1, 60) if truncated else None)
 
 
 @pytest.mark.parametrize("kind", ["absolute gradient", "features, colours, offsets"])
-def test_footprints_equal_the_oracle(engine: CudaEngine, kind: str) -> None:
+def test_footprints_equal_the_oracle(engine, kind):
     inputs = projected(scenes.random_scene(5, **native.KINDS[kind]))
     expect_oracle(engine, inputs, scenes.random_thresholds(5, 60))
 
 
-def test_a_soft_rim_is_refused(engine: CudaEngine) -> None:
+def test_a_soft_rim_is_refused(engine):
     with pytest.raises(InputError, match=r"soft rim.*--device cpu"):
         engine.rasterize(scenes.random_scene(0, 4, rim="soft"), torch.full((4,), 0.5))
 
 
-def test_surfels_are_refused(engine: CudaEngine) -> None:
+def test_surfels_are_refused(engine):
     with pytest.raises(EngineError, match=r"surfels.*--device cpu"):
         engine.rasterize(scenes.random_scene(5, 20, flat=True), None)
 
 
-def test_tiles_of_footprints_may_be_any_integers(engine: CudaEngine) -> None:
+def test_tiles_of_footprints_may_be_any_integers(engine):
     inputs = projected(scenes.random_scene(5))
     wide = replace(inputs, splats=replace(inputs.splats, tiles=inputs.splats.tiles.long()))
     drawn = [everything(engine, each, None)["image"] for each in (inputs, wide)]
     assert torch.equal(*drawn)
 
 
-def test_what_fine_tuning_freezes_costs_no_kernel_and_changes_no_gradient(
-    engine: CudaEngine, device: EmulatedDevice
-) -> None:
+def test_what_fine_tuning_freezes_costs_no_kernel_and_changes_no_gradient(engine, device):
     inputs, thresholds = scenes.random_scene(0), scenes.random_thresholds(0, 60)
     made, leaves = scenes.leaves(inputs)
     tau = thresholds.clone().requires_grad_()
@@ -92,7 +87,7 @@ def test_what_fine_tuning_freezes_costs_no_kernel_and_changes_no_gradient(
         assert (whole - part).abs().max() < 1e-5 * whole.abs().max()
 
 
-def test_deterministic_runs_agree_to_the_bit_whatever_the_order(device: EmulatedDevice) -> None:
+def test_deterministic_runs_agree_to_the_bit_whatever_the_order(device):
     engine = CudaEngine(device, deterministic=True)
     inputs = scenes.random_scene(3, 150, 50, 37, features=3, colors=True)
     thresholds = torch.full((150,), 0.05)
@@ -105,9 +100,7 @@ def test_deterministic_runs_agree_to_the_bit_whatever_the_order(device: Emulated
     check_gradients(engine, inputs, thresholds, same)
 
 
-def test_images_counts_and_scores_do_not_depend_on_the_order(
-    engine: CudaEngine, device: EmulatedDevice
-) -> None:
+def test_images_counts_and_scores_do_not_depend_on_the_order(engine, device):
     inputs = scenes.random_scene(4, 300, 70, 50, scores=True, counts=True)
     found = []
     for device.seed in (1, 2):
@@ -123,9 +116,7 @@ def test_images_counts_and_scores_do_not_depend_on_the_order(
     [(9000, 70, 50, 0.15), (150, 330, 290, 6.0)],
     ids=["several blocks sort", "more tiles than one pass of sorting tells apart; giants"],
 )
-def test_larger_scenes_equal_the_cpu_engine(
-    engine: CudaEngine, n: int, width: int, height: int, size: float
-) -> None:
+def test_larger_scenes_equal_the_cpu_engine(engine, n, width, height, size):
     inputs = scenes.random_scene(3, n, width, height, scale_modifier=size, counts=True)
     thresholds = scenes.random_thresholds(3, n)
     with torch.no_grad():
@@ -137,7 +128,7 @@ def test_larger_scenes_equal_the_cpu_engine(
     assert (expected.image - found.image)[:, same].abs().max() < 4e-5
 
 
-def test_lists_that_do_not_fit_are_drawn_again_with_more_room(device: EmulatedDevice) -> None:
+def test_lists_that_do_not_fit_are_drawn_again_with_more_room(device):
     inputs, thresholds = scenes.random_scene(0), scenes.random_thresholds(0, 60)
     whole, small = CudaEngine(device), CudaEngine(device)
     small.capacity = 7
@@ -147,9 +138,7 @@ def test_lists_that_do_not_fit_are_drawn_again_with_more_room(device: EmulatedDe
         assert torch.equal(expected[name], found[name]), name
 
 
-def test_room_that_another_thread_makes_meanwhile_is_not_this_frames(
-    device: EmulatedDevice, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_room_that_another_thread_makes_meanwhile_is_not_this_frames(device, monkeypatch):
     inputs, small, read = scenes.random_scene(0), CudaEngine(device), frame.Drawing.read
     expected = small.rasterize(inputs, None).image
     small.capacity = 7
@@ -162,9 +151,7 @@ def test_room_that_another_thread_makes_meanwhile_is_not_this_frames(
     assert torch.equal(small.rasterize(inputs, None).image, expected)
 
 
-def test_room_is_not_made_for_more_entries_than_can_be_counted(
-    device: EmulatedDevice, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_room_is_not_made_for_more_entries_than_can_be_counted(device, monkeypatch):
     inputs, small = scenes.random_scene(0), CudaEngine(device)
     most = 1 + round(small.rasterize(inputs, None).entries_per_pixel * 40 * 28)
     monkeypatch.setattr(cuda, "ENTRIES_MAX", most)
@@ -173,33 +160,27 @@ def test_room_is_not_made_for_more_entries_than_can_be_counted(
     assert small.capacity == most
 
 
-def test_more_entries_than_can_be_counted_are_refused(
-    engine: CudaEngine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_more_entries_than_can_be_counted_are_refused(engine, monkeypatch):
     monkeypatch.setattr(frame, "ENTRIES_MAX", 10)
     with pytest.raises(EngineError, match="entries"):
         engine.rasterize(scenes.random_scene(0), None)
 
 
-def test_tensors_elsewhere_are_refused(
-    engine: CudaEngine, device: EmulatedDevice, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tensors_elsewhere_are_refused(engine, device, monkeypatch):
     monkeypatch.setattr(device, "kind", "cuda")
     with pytest.raises(InputError, match="Gaussians on cpu"):
         engine.rasterize(scenes.random_scene(0), None)
 
 
 @pytest.mark.parametrize("rows", [0, 10, 61])
-def test_thresholds_of_another_model_are_refused(
-    engine: CudaEngine, device: EmulatedDevice, rows: int
-) -> None:
+def test_thresholds_of_another_model_are_refused(engine, device, rows):
     before = len(device.launched)
     with pytest.raises(InputError, match=rf"thresholds: shape \({rows},\)"):
         engine.rasterize(scenes.random_scene(0), torch.full((rows,), 0.1))
     assert len(device.launched) == before
 
 
-def test_a_poisoned_pixel_reaches_those_alone_that_draw_there(engine: CudaEngine) -> None:
+def test_a_poisoned_pixel_reaches_those_alone_that_draw_there(engine):
     inputs = scenes.random_scene(6, 200, 50, 37, features=3)
 
     def rows(at_pixel: float, elsewhere: float, found) -> torch.Tensor:

@@ -2,12 +2,10 @@
 
 import ctypes
 import itertools
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from pathlib import Path
 
 import pytest
 import torch
+from gpu.emulated import Watched
 from gpu.holding import Holding
 
 from fragprune_plugins.engines.cpu import binding
@@ -22,30 +20,6 @@ SMALL = Workload(
 )
 
 
-@dataclass
-class Watched:
-    """The emulation, and somebody who looks at, or tampers with, what its kernels did.
-
-    Attributes:
-        device: the emulation.
-        after: called after each launch, with the kernel's name and arguments.
-        launched: how often each kernel was.
-    """
-
-    device: EmulatedDevice
-    after: Callable[[str, ctypes.Structure], None]
-    launched: dict[str, int] = field(default_factory=dict)
-    kind = "cpu"
-
-    def launch(self, where, source, macros, kernel, blocks, arguments) -> None:
-        self.device.launch(where, source, macros, kernel, blocks, arguments)
-        self.launched[kernel] = self.launched.get(kernel, 0) + 1
-        self.after(kernel, arguments)
-
-    def capturing(self, where: torch.device) -> bool:
-        return False
-
-
 def array(address: int, count: int, kind: type = ctypes.c_float) -> ctypes.Array:
     """Memory that a kernel was handed."""
     return (kind * count).from_address(address)
@@ -58,7 +32,7 @@ def memory(monkeypatch: pytest.MonkeyPatch):
         yield
 
 
-def test_a_sound_engine_agrees(device: EmulatedDevice) -> None:
+def test_a_sound_engine_agrees(device):
     assert compare(device, CPU, SMALL) == []
 
 
@@ -66,9 +40,7 @@ RUNS = itertools.count()
 
 
 @pytest.mark.slow  # compiles every kernel anew
-def test_the_rounding_of_a_gpus_special_units_is_no_fault(
-    device: EmulatedDevice, tmp_path: Path
-) -> None:
+def test_the_rounding_of_a_gpus_special_units_is_no_fault(device, tmp_path):
     assert (
         compare(EmulatedDevice(device.compiler, tmp_path, ("-DEMULATED_ROUGH",)), CPU, SMALL) == []
     )
@@ -125,7 +97,7 @@ def nothing_in_the_widest_rows_of_tiles(kernel: str, arguments: ctypes.Structure
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
-def test_a_fault_is_found(device: EmulatedDevice, fault, part: str, said: str) -> None:
+def test_a_fault_is_found(device, fault, part, said):
     assert said in "; ".join(only(part, Watched(device, fault)))
 
 
@@ -140,7 +112,7 @@ def only(part: str, device: EmulatedDevice | Watched) -> list[str]:
     return list(compared(device, CPU, *how))
 
 
-def test_memory_that_frames_leave_behind_is_found(device: EmulatedDevice, monkeypatch) -> None:
+def test_memory_that_frames_leave_behind_is_found(device, monkeypatch):
     left = []
 
     class Leaking(frame.Drawing):
@@ -154,9 +126,7 @@ def test_memory_that_frames_leave_behind_is_found(device: EmulatedDevice, monkey
     assert "bytes more are held after 3 steps" in found
 
 
-def test_without_the_cpu_engine_large_frames_are_compared_with_themselves(
-    device: EmulatedDevice, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_the_cpu_engine_large_frames_are_compared_with_themselves(device, monkeypatch):
     monkeypatch.setattr(binding, "available", lambda: False)
     assert only("large", device) == []
     found = only("large", Watched(device, another_picture_each_time))

@@ -1,6 +1,5 @@
 """Every kernel compiles for every architecture, and none of its numbers leaves the registers."""
 
-import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -34,17 +33,6 @@ TUNED = unblend_macros(frozenset(("opacities", "thresholds")), sh_turns=True)
 """Fine-tuning."""
 
 
-@pytest.fixture(scope="module")
-def nvrtc() -> kernels.Nvrtc:
-    """The development extra brings it on Linux: there, its absence is a failure."""
-    try:
-        return kernels.Nvrtc()
-    except kernels.Unavailable as why:
-        if sys.platform.startswith("linux"):
-            raise
-        pytest.skip(str(why))
-
-
 def check(image: kernels.Image) -> None:
     found = resources(image.log)
     assert found
@@ -55,9 +43,7 @@ def check(image: kernels.Image) -> None:
 
 
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
-def test_all_kernels_compile_without_stack_or_spills(
-    nvrtc: kernels.Nvrtc, architecture: int
-) -> None:
+def test_all_kernels_compile_without_stack_or_spills(nvrtc, architecture):
     assert architecture in nvrtc.architectures
     with ThreadPoolExecutor(2) as pool:
         jobs = [
@@ -76,26 +62,24 @@ def test_all_kernels_compile_without_stack_or_spills(
         check(job.result())
 
 
-def test_volta_is_drawn_on_where_the_toolkit_still_makes_code_for_it(
-    nvrtc: kernels.Nvrtc, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_volta_is_drawn_on_where_the_toolkit_still_makes_code_for_it(nvrtc, monkeypatch):
     """It has all that kernels need; NVRTC 12 knows it, and 13 does not."""
     monkeypatch.setattr(nvrtc._nvrtc, "nvrtcGetSupportedArchs", lambda: (0, [60, 70, 75]))
     assert kernels.target_of(70, kernels.Nvrtc().architectures) == "sm_70"
 
 
 @pytest.mark.parametrize("source", ["blend", "unblend"])
-def test_all_that_can_be_asked_for_at_once_compiles(nvrtc: kernels.Nvrtc, source: str) -> None:
+def test_all_that_can_be_asked_for_at_once_compiles(nvrtc, source):
     check(nvrtc.compile(source, {**MACROS, **EVERYTHING}, "sm_75"))
 
 
-def test_the_sources_check_the_structs_that_they_are_handed(nvrtc: kernels.Nvrtc) -> None:
+def test_the_sources_check_the_structs_that_they_are_handed(nvrtc):
     for name in MACROS:
         with pytest.raises(kernels.Unavailable, match="has other fields"):
             nvrtc.compile("unblend", {**MACROS, name: 8}, "sm_90")
 
 
-def test_a_gpu_that_the_toolkit_does_not_know_gets_ptx(nvrtc: kernels.Nvrtc) -> None:
+def test_a_gpu_that_the_toolkit_does_not_know_gets_ptx(nvrtc):
     assert kernels.target_of(90, (75, 90)) == "sm_90"
     assert kernels.target_of(99, (75, 90, 100)) == "compute_90"
     with pytest.raises(kernels.Unavailable, match="older"):
@@ -103,5 +87,5 @@ def test_a_gpu_that_the_toolkit_does_not_know_gets_ptx(nvrtc: kernels.Nvrtc) -> 
     assert b".target sm_75" in nvrtc.compile("blend", MACROS, "compute_75").code
 
 
-def test_what_is_built_beforehand_is_what_training_asks_for() -> None:
+def test_what_is_built_beforehand_is_what_training_asks_for():
     assert {source for source, _ in VARIANTS} == {"scene", "blend", "unblend"}

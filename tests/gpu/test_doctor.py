@@ -1,7 +1,6 @@
 """What ``fragprune doctor`` says about GPUs, and what it builds for them."""
 
 import json
-from pathlib import Path
 
 import pytest
 import torch
@@ -35,7 +34,7 @@ def invoke(*arguments: str) -> tuple[int, dict]:
     return done.exit_code, json.loads(done.stdout)
 
 
-def test_kernels_are_built_beforehand_and_kept(kept: Path, monkeypatch) -> None:
+def test_kernels_are_built_beforehand_and_kept(kept, monkeypatch):
     monkeypatch.setattr(kernels, "compiler", Compiler)
     status, first = invoke("--build-cuda", "90, sm_100")
     assert status == 0
@@ -48,7 +47,7 @@ def test_kernels_are_built_beforehand_and_kept(kept: Path, monkeypatch) -> None:
     assert all(k["kept"] for k in invoke("--build-cuda", "90")[1]["kernels"])
 
 
-def test_what_cannot_be_built_is_an_error(kept: Path, monkeypatch) -> None:
+def test_what_cannot_be_built_is_an_error(kept, monkeypatch):
     monkeypatch.setattr(kernels, "compiler", Compiler)
     status, said = invoke("--build-cuda", "75")
     assert (status, said["error"]["code"]) == (1, "engine")
@@ -56,7 +55,7 @@ def test_what_cannot_be_built_is_an_error(kept: Path, monkeypatch) -> None:
     assert invoke("--build-cuda", "ampere")[0] == 2
 
 
-def test_it_says_why_there_is_no_engine_for_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_says_why_there_is_no_engine_for_gpus(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setenv(kernels.ENVIRONMENT, "off")
     gpu = invoke()[1]["gpu"]
@@ -77,8 +76,8 @@ def test_it_says_why_there_is_no_engine_for_gpus(monkeypatch: pytest.MonkeyPatch
     ids=lambda value: getattr(value, "outcome", ""),
 )
 def test_a_gpu_is_checked_each_time_and_what_failed_told_from_what_could_not_run(
-    monkeypatch: pytest.MonkeyPatch, verdict: Verdict, status: int, agrees: bool | None, said: str
-) -> None:
+    monkeypatch, verdict, status, agrees, said
+):
     monkeypatch.setattr(driver, "missing", lambda: None)
     gpu = {"available": True, "device": "A GPU", "capability": "9.0", "compiler": "nvrtc 13.0"}
     monkeypatch.setattr(work, "_cuda_engine", lambda: gpu | {"kept": "cache", "reason": None})
@@ -92,7 +91,7 @@ def test_a_gpu_is_checked_each_time_and_what_failed_told_from_what_could_not_run
     assert f"{line}{verdict}\n" in text
 
 
-def test_what_is_missing_is_a_sentence_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_missing_is_a_sentence_with_what_to_do(monkeypatch):
     monkeypatch.setattr(torch.version, "cuda", None)
     monkeypatch.setenv(kernels.ENVIRONMENT, "off")
     lines = CliRunner().invoke(cli, ["doctor"]).output.splitlines()

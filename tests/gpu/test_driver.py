@@ -12,14 +12,11 @@ from pathlib import Path
 import pytest
 import scenes
 import torch
-from gpu.test_compile import nvrtc
 from native.test_invariants import everything
 
 from fragprune_plugins.engines.cuda import kernels
 from fragprune_plugins.engines.cuda.engine import CudaEngine
 from fragprune_plugins.workbench.doctor.emulated import EmulatedDevice
-
-__all__ = ["nvrtc"]
 
 BEGIN = """
 import os
@@ -141,7 +138,7 @@ def script(
     return run
 
 
-def test_the_driver_is_asked_for_what_the_emulation_does(script: Callable[[str], str]) -> None:
+def test_the_driver_is_asked_for_what_the_emulation_does(script):
     """And drawing on another GPU leaves the current one; one test, for its kernels take long."""
     said = script(BOTH_KINDS_OF_CODE)
     assert "fp_blend from machine code" in said
@@ -149,8 +146,6 @@ def test_the_driver_is_asked_for_what_the_emulation_does(script: Callable[[str],
     script(ANOTHER_GPU)
 
 
-def test_what_an_earlier_kernel_did_is_not_put_on_the_code_of_the_next(
-    script: Callable[[str], str],
-) -> None:
+def test_what_an_earlier_kernel_did_is_not_put_on_the_code_of_the_next(script):
     """A failed kernel fails every later call, so loading code would seem to be refused."""
     script(AN_EARLIER_KERNEL_FAILED)

@@ -18,7 +18,7 @@ def run(device: BrokenDevice, kernel: str, blocks: int = 3) -> torch.Tensor:
     return to
 
 
-def test_a_missing_barrier_shows(broken: BrokenDevice) -> None:
+def test_a_missing_barrier_shows(broken):
     expected = torch.arange(255, -1, -1, dtype=torch.int32).repeat(3)
     assert torch.equal(run(broken, "fp_with_barrier"), expected)
     assert not torch.equal(run(broken, "fp_no_barrier"), expected)
@@ -35,8 +35,6 @@ def test_a_missing_barrier_shows(broken: BrokenDevice) -> None:
         ("fp_unheard_of", "no such kernel"),
     ],
 )
-def test_threads_that_lose_each_other_are_reported(
-    broken: BrokenDevice, kernel: str, message: str
-) -> None:
+def test_threads_that_lose_each_other_are_reported(broken, kernel, message):
     with pytest.raises(RuntimeError, match=message):
         run(broken, kernel)

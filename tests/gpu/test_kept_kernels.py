@@ -4,7 +4,6 @@ import errno
 import os
 import threading
 import time
-from pathlib import Path
 
 import filelock
 import pytest
@@ -26,7 +25,7 @@ class Slow:
         return kernels.Image(f"{source}{target}\n\0".encode(), "a log\nof two lines")
 
 
-def test_the_second_time_costs_nothing(kept: Path) -> None:
+def test_the_second_time_costs_nothing(kept):
     slow = Slow()
     first, had = kernels.image_of("blend", {"A": 1}, "sm_90", slow)
     assert not had
@@ -34,7 +33,7 @@ def test_the_second_time_costs_nothing(kept: Path) -> None:
     assert slow.count == 1
 
 
-def test_whatever_changes_the_code_is_compiled_anew(kept: Path, monkeypatch) -> None:
+def test_whatever_changes_the_code_is_compiled_anew(kept, monkeypatch):
     slow = Slow()
     for source, macros, target in (
         ("blend", {}, "sm_90"),
@@ -49,7 +48,7 @@ def test_whatever_changes_the_code_is_compiled_anew(kept: Path, monkeypatch) -> 
 
 
 @pytest.mark.skipif(os.name != "posix", reason="other permissions")
-def test_what_one_user_builds_others_may_read(kept: Path) -> None:
+def test_what_one_user_builds_others_may_read(kept):
     """As kernels in a folder that a cluster's jobs share."""
     before = os.umask(0o022)
     try:
@@ -60,7 +59,7 @@ def test_what_one_user_builds_others_may_read(kept: Path) -> None:
     assert path.stat().st_mode & 0o777 == 0o644
 
 
-def test_damaged_files_are_compiled_anew(kept: Path) -> None:
+def test_damaged_files_are_compiled_anew(kept):
     slow = Slow()
     whole, _ = kernels.image_of("blend", {}, "sm_90", slow)
     (path,) = kept.glob("*.bin")
@@ -70,7 +69,7 @@ def test_damaged_files_are_compiled_anew(kept: Path) -> None:
     assert kernels.image_of("blend", {}, "sm_90", slow) == (whole, True)
 
 
-def test_those_who_want_the_same_wait_for_the_first(kept: Path) -> None:
+def test_those_who_want_the_same_wait_for_the_first(kept):
     slow, found = Slow(), []
     crowd = [
         threading.Thread(target=lambda: found.append(kernels.image_of("a", {}, "sm_90", slow)))
@@ -87,9 +86,7 @@ def test_those_who_want_the_same_wait_for_the_first(kept: Path) -> None:
 @pytest.mark.parametrize(
     "refusal", [NotImplementedError("no flock"), OSError(errno.ENOLCK, "no locks")], ids=type
 )
-def test_where_files_cannot_be_locked_they_are_kept_all_the_same(
-    kept: Path, monkeypatch: pytest.MonkeyPatch, refusal: Exception
-) -> None:
+def test_where_files_cannot_be_locked_they_are_kept_all_the_same(kept, monkeypatch, refusal):
     def refuse(*_: object, **__: object) -> None:
         raise refusal
 
@@ -100,7 +97,7 @@ def test_where_files_cannot_be_locked_they_are_kept_all_the_same(
     assert kernels.image_of("blend", {}, "sm_90", slow) == (first, True)
 
 
-def test_without_a_folder_nothing_is_kept(tmp_path: Path, monkeypatch) -> None:
+def test_without_a_folder_nothing_is_kept(tmp_path, monkeypatch):
     file = tmp_path / "file"
     file.touch()
     monkeypatch.setenv(kernels.CACHE, str(file / "folder"))
@@ -110,7 +107,7 @@ def test_without_a_folder_nothing_is_kept(tmp_path: Path, monkeypatch) -> None:
     assert slow.count == 2
 
 
-def test_the_environment_switches_the_compiler_off(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_environment_switches_the_compiler_off(monkeypatch):
     monkeypatch.setenv(kernels.ENVIRONMENT, "off")
     with pytest.raises(kernels.Unavailable, match="switched off"):
         kernels.compiler()

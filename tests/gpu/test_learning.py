@@ -6,11 +6,10 @@ from finetune import tiny
 
 from fragprune_plugins import Pressure, Settings, finetune
 from fragprune_plugins.engines import create_engine
-from fragprune_plugins.engines.cuda.engine import CudaEngine
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
 
 
-def test_learned_and_measured_as_on_the_cpu(engine: CudaEngine, tmp_path) -> None:
+def test_learned_and_measured_as_on_the_cpu(engine, tmp_path):
     truth = tiny.random_model()
     dataset = tiny.dataset_in_memory(tmp_path, truth)
     settings = Settings(iterations=3, goal=Pressure(1e-3))

@@ -12,9 +12,9 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+from gpu.test_compile import ARCHITECTURES, TRAINED
 
-from fragprune_plugins.engines.cuda import kernels
-from fragprune_plugins.engines.cuda.frame import MACROS, unblend_macros
+from fragprune_plugins.engines.cuda.frame import MACROS
 
 STEPS = {
     "fp_blend": (37, {"special": 1, "shared": 3}),
@@ -25,15 +25,7 @@ STEPS = {
 SLACK = 1.1
 """For other versions of NVRTC."""
 
-ARCHITECTURES = (
-    90,
-    *(pytest.param(n, marks=pytest.mark.slow) for n in (75, 80, 86, 87, 89, 100, 120)),
-)
-
-SOURCES = {
-    "blend": {},
-    "unblend": unblend_macros(frozenset(("means", "opacities", "thresholds")), sh_turns=True),
-}
+SOURCES = {"blend": {}, "unblend": TRAINED}
 
 KINDS = {"MUFU": "special", "LDS": "shared", "STS": "shared", "LDL": "local", "STL": "local"}
 
@@ -88,11 +80,9 @@ def test_a_loop_is_what_lies_between_a_label_and_a_branch_back():
 
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
 @pytest.mark.parametrize("source", SOURCES)
-def test_a_step_takes_no_more_instructions_than_it_did(nvdisasm, tmp_path, source, architecture):
-    try:
-        nvrtc = kernels.Nvrtc()
-    except kernels.Unavailable as why:
-        pytest.skip(str(why))
+def test_a_step_takes_no_more_instructions_than_it_did(
+    nvrtc, nvdisasm, tmp_path, source, architecture
+):
     image = nvrtc.compile(source, {**MACROS, **SOURCES[source]}, f"sm_{architecture}")
     (tmp_path / "kernels.cubin").write_bytes(image.code)
     found = kernels_of(nvdisasm, tmp_path / "kernels.cubin")

@@ -24,16 +24,16 @@ class OnGpu:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_images_and_gradients_equal_the_oracle(kind: str) -> None:
+def test_images_and_gradients_equal_the_oracle(kind):
     inputs = scenes.random_scene(1, **native.KINDS[kind])
     native.expect_oracle(OnGpu(), inputs, scenes.random_thresholds(1, 60))
 
 
-def test_the_check_that_comes_before_use_is_passed() -> None:
+def test_the_check_that_comes_before_use_is_passed():
     assert compare(Driver(), torch.device("cuda:0")) == []
 
 
-def test_runs_agree_to_the_bit_at_size() -> None:
+def test_runs_agree_to_the_bit_at_size():
     engine = CudaEngine(deterministic=True)
     asked = {"scores": True, "counts": True, "device": "cuda"}
     inputs = scenes.random_scene(0, 200_000, 1300, 900, scale_modifier=0.3, **asked)

@@ -31,7 +31,7 @@ def proof(device: EmulatedDevice, monkeypatch: pytest.MonkeyPatch) -> Report:
     return prove.prove(lambda text: None, repeats=2)
 
 
-def test_kernels_that_agree_are_proved_and_not_timed(device: EmulatedDevice, monkeypatch) -> None:
+def test_kernels_that_agree_are_proved_and_not_timed(device, monkeypatch):
     report = proof(device, monkeypatch)
     emulation = report.data["emulation"]
     assert report.exit_code == 0, report.text
@@ -55,8 +55,8 @@ def test_kernels_that_agree_are_proved_and_not_timed(device: EmulatedDevice, mon
     ids=["alpha", "cut", "rim", "no C++"],
 )
 def test_a_change_in_a_kernels_text_makes_the_proof_fail(
-    device: EmulatedDevice, tmp_path: Path, monkeypatch, source, text, changed, said
-) -> None:
+    device, tmp_path, monkeypatch, source, text, changed, said
+):
     whole = (kernels.SOURCES / f"{source}.cu").read_text()
     assert text in whole
     copy = tmp_path / f"{source}.cu"

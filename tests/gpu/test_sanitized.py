@@ -33,7 +33,7 @@ def run(device: EmulatedDevice):
 @pytest.mark.parametrize(
     ("kind", "resident"), [("thread", 1), ("thread", 3), ("address", 3), ("undefined", 3)]
 )
-def test_all_kernels_in_all_dialects_are_clean(run, kind: str, resident: int) -> None:
+def test_all_kernels_in_all_dialects_are_clean(run, kind, resident):
     status, said = run(kind, "--resident", str(resident))
     assert status == 0, said[-6000:]
     assert f"seed {len(sanitized.DIALECTS) - 1}" in said
@@ -50,7 +50,7 @@ def test_all_kernels_in_all_dialects_are_clean(run, kind: str, resident: int) ->
         ("undefined", "fp_shifts_too_far", "shift exponent"),
     ],
 )
-def test_a_planted_fault_is_seen(run, kind: str, kernel: str, said: str) -> None:
+def test_a_planted_fault_is_seen(run, kind, kernel, said):
     status, heard = run(kind, "--broken", kernel)
     assert status != 0
     assert said in heard
@@ -66,6 +66,6 @@ def test_a_planted_fault_is_seen(run, kind: str, kernel: str, said: str) -> None
         ("undefined", "fp_with_barrier"),
     ],
 )
-def test_the_right_way_is_not_taken_for_a_fault(run, kind: str, kernel: str) -> None:
+def test_the_right_way_is_not_taken_for_a_fault(run, kind, kernel):
     status, said = run(kind, "--broken", kernel)
     assert status == 0, said[-6000:]

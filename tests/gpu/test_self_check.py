@@ -39,7 +39,7 @@ def checks(kept: Path, monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.parametrize("verdict", [AGREES, FAILS], ids=lambda verdict: verdict.outcome)
-def test_a_verdict_is_remembered_on_the_machine(checks: list, verdict: Verdict) -> None:
+def test_a_verdict_is_remembered_on_the_machine(checks, verdict):
     checks += [verdict, COULD_NOT_RUN]
     expected = None if verdict is AGREES else verdict
     assert why_not("cuda") == expected
@@ -48,14 +48,14 @@ def test_a_verdict_is_remembered_on_the_machine(checks: list, verdict: Verdict) 
     assert checks == [COULD_NOT_RUN]
 
 
-def test_a_check_that_could_not_run_is_made_again_by_the_next_process(checks: list) -> None:
+def test_a_check_that_could_not_run_is_made_again_by_the_next_process(checks):
     checks += [COULD_NOT_RUN, AGREES]
     assert [why_not("cuda"), why_not("cuda")] == [COULD_NOT_RUN] * 2
     a_new_process()
     assert why_not("cuda") is None
 
 
-def test_what_doctor_finds_meanwhile_counts_at_once(checks: list) -> None:
+def test_what_doctor_finds_meanwhile_counts_at_once(checks):
     checks += [COULD_NOT_RUN, FAILS, AGREES]
     assert why_not("cuda") == COULD_NOT_RUN
     for found in (FAILS, AGREES):
@@ -63,7 +63,7 @@ def test_what_doctor_finds_meanwhile_counts_at_once(checks: list) -> None:
         assert why_not("cuda") == (None if found is AGREES else found)
 
 
-def test_a_damaged_memory_is_none(checks: list, kept: Path) -> None:
+def test_a_damaged_memory_is_none(checks, kept):
     checks += [AGREES, FAILS]
     assert why_not("cuda") is None
     a_new_process()
@@ -73,8 +73,8 @@ def test_a_damaged_memory_is_none(checks: list, kept: Path) -> None:
 
 
 def test_a_folder_that_cannot_be_written_leaves_the_check_to_each_process(
-    checks: list, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    checks, tmp_path, monkeypatch
+):
     (tmp_path / "file").touch()
     monkeypatch.setenv(kernels.CACHE, str(tmp_path / "file" / "folder"))
     checks += [AGREES, AGREES]
@@ -84,9 +84,7 @@ def test_a_folder_that_cannot_be_written_leaves_the_check_to_each_process(
     assert checks == []
 
 
-def test_it_holds_for_gpus_of_one_kind_a_driver_and_this_text(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_it_holds_for_gpus_of_one_kind_a_driver_and_this_text(monkeypatch):
     gpu = {"name": "H100", "major": 9, "minor": 0, "multi_processor_count": 132, "uuid": "a"}
     compiler = SimpleNamespace(name="nvrtc", version="13.5")
     monkeypatch.setattr(kernels, "compiler", lambda: compiler)
@@ -124,9 +122,7 @@ def test_it_holds_for_gpus_of_one_kind_a_driver_and_this_text(
         ("time.sleep(60)", Verdict("could not run", "no end within 1 s")),
     ],
 )
-def test_crashes_and_hangs_stay_in_a_process_of_their_own(
-    monkeypatch: pytest.MonkeyPatch, program: str, verdict: Verdict
-) -> None:
+def test_crashes_and_hangs_stay_in_a_process_of_their_own(monkeypatch, program, verdict):
     real = subprocess.run
     monkeypatch.setattr(self_check, "PATIENCE", 1 if "sleep" in program else 60)
     command = [sys.executable, "-c", f"import os, sys, time; {program}"]
@@ -152,8 +148,8 @@ def test_crashes_and_hangs_stay_in_a_process_of_their_own(
     ids=str,
 )
 def test_what_went_wrong_is_told_from_what_could_not_be_tried(
-    monkeypatch: pytest.MonkeyPatch, capsys, found: list | Exception, status: int, said: str
-) -> None:
+    monkeypatch, capsys, found, status, said
+):
     def compare(gpu: object, where: torch.device) -> list:
         if isinstance(found, Exception):
             raise found
@@ -168,7 +164,7 @@ def test_what_went_wrong_is_told_from_what_could_not_be_tried(
     assert len(printed.err.splitlines()) <= 1
 
 
-def test_a_gpu_that_is_another_process_s_could_not_be_tried(monkeypatch, capsys) -> None:
+def test_a_gpu_that_is_another_process_s_could_not_be_tried(monkeypatch, capsys):
     def busy(*_: object, **__: object) -> None:
         raise RuntimeError("CUDA error: CUDA-capable device(s) is/are busy or unavailable\nMore")
 
@@ -187,7 +183,7 @@ def test_a_gpu_that_is_another_process_s_could_not_be_tried(monkeypatch, capsys)
         ("13.0", "fragprune-plugins[cuda13],"),
     ],
 )
-def test_the_extra_of_torchs_own_cuda_is_named(monkeypatch, cuda: str, extra: str) -> None:
+def test_the_extra_of_torchs_own_cuda_is_named(monkeypatch, cuda, extra):
     monkeypatch.setattr(torch.version, "cuda", cuda)
     assert extra in driver.remedy()
 
@@ -203,9 +199,7 @@ def test_the_extra_of_torchs_own_cuda_is_named(monkeypatch, cuda: str, extra: st
         (None, r"Install fragprune-plugins\[cuda12\], for torch is for CUDA 12.8"),
     ],
 )
-def test_auto_refuses_a_gpu_without_it_and_says_what_to_do(
-    checks: list, monkeypatch: pytest.MonkeyPatch, verdict: Verdict | None, remedy: str
-) -> None:
+def test_auto_refuses_a_gpu_without_it_and_says_what_to_do(checks, monkeypatch, verdict, remedy):
     if verdict is None:  # the extra of another CUDA
         monkeypatch.setattr(driver, "missing", lambda: "no NVRTC library: libnvrtc.so.13")
         monkeypatch.setattr(torch.version, "cuda", "12.8")
@@ -218,7 +212,7 @@ def test_auto_refuses_a_gpu_without_it_and_says_what_to_do(
     assert engines.create_engine("reference", "cuda").rasterize(scenes.random_scene(0), None)
 
 
-def test_a_gpu_where_it_agrees_gets_it(checks: list, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gpu_where_it_agrees_gets_it(checks, monkeypatch):
     checks += [AGREES]
     monkeypatch.setattr(
         "fragprune_plugins.engines.cuda.engine.CudaEngine", lambda: "the cuda engine"

@@ -8,7 +8,6 @@ from finetune.several import learn
 
 from fragprune_plugins import RasterInputs, ShardedEngine, ThresholdStore, part_of
 from fragprune_plugins.engines.cuda.engine import CudaEngine
-from fragprune_plugins.workbench.ranks import Ranks
 
 LEARNED = ("xyz", "f_rest", "opacity", "scaling")
 
@@ -46,8 +45,3 @@ def test_the_kernels_draw_shards_as_they_draw_the_whole(device):
     for expected, *found in zip(gradients, *(part[1] for part in parts), strict=True):
         scale = float(expected.abs().max())
         assert torch.allclose(torch.cat(found), expected, atol=2e-6 * scale, rtol=1e-5)
-
-
-def test_one_process_is_all_processes(engine):
-    alone, _ = drawn(ShardedEngine(engine, Ranks()), scene(20), [0])
-    assert torch.allclose(alone[0], drawn(engine, scene(20), [0])[0][0], atol=1e-6)

@@ -4,6 +4,7 @@ import ctypes
 
 import pytest
 import torch
+from gpu.emulated import Watched
 from native.test_slice import (
     test_coefficients_that_are_not_in_use_have_no_gradient,
     test_each_output_has_its_own_gradients,
@@ -35,13 +36,10 @@ def test_any_number_of_them(engine, device, count):
 
 
 def test_a_gpu_that_cuts_wrongly_is_refused(device):
-    class Faulty:
-        kind = "cpu"
+    def tamper(kernel, arguments):
+        if kernel == "fp_slice":
+            (ctypes.c_float * 3000).from_address(arguments.sliced.opacities)[2999] = 2.0
 
-        def launch(self, where, source, macros, kernel, blocks, arguments):
-            device.launch(where, source, macros, kernel, blocks, arguments)
-            if kernel == "fp_slice":
-                (ctypes.c_float * 3000).from_address(arguments.sliced.opacities)[2999] = 2.0
-
+    given = leaves(splats("joint", 20), torch.float32)
     with pytest.raises(EngineError, match="opacities are off by"):
-        cut(CudaEngine(Faulty()), leaves(splats("joint", 20), torch.float32), moment())
+        cut(CudaEngine(Watched(device, tamper)), given, moment())

@@ -37,8 +37,8 @@ def counting(device: EmulatedDevice, tmp_path_factory: pytest.TempPathFactory) -
     ],
 )
 def test_sectors_and_turns_are_those_of_the_pattern(
-    counting: Patterns, kernel: str, kind: str, requests: int, lanes: int, units: int, least: int
-) -> None:
+    counting, kernel, kind, requests, lanes, units, least
+):
     room = torch.zeros(8 * 256 + 8, dtype=torch.int32)
     place = -(-room.data_ptr() // 32) * 32  # a sector begins there
     counting.launch(room.device, "patterns", {}, kernel, 3, Numbers(to=place))

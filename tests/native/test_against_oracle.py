@@ -131,7 +131,7 @@ def check_images(
     assert ours.evaluated_per_pixel >= mean
 
 
-def test_large_pictures_are_written_whole_past_the_caches(engine: CpuEngine) -> None:
+def test_large_pictures_are_written_whole_past_the_caches(engine):
     """Their rows are lines of memory, 262,144 pixels or more, the lowest tiles cut.
 
     Coordinates are ten times the other scenes', and a float's distance between them.
@@ -221,7 +221,7 @@ def projected(inputs: RasterInputs) -> RasterInputs:
         if how != "projected before" or "flat" not in KINDS[kind]
     ],
 )
-def test_images_and_gradients_equal_the_oracle(engine: CpuEngine, kind: str, how: str) -> None:
+def test_images_and_gradients_equal_the_oracle(engine, kind, how):
     inputs = scenes.random_scene(5, **KINDS[kind])
     if how == "projected before":
         inputs = projected(inputs)
@@ -229,14 +229,14 @@ def test_images_and_gradients_equal_the_oracle(engine: CpuEngine, kind: str, how
 
 
 @pytest.mark.parametrize("stop", [None, 1e-4, 0.011, 1.0])
-def test_tall_stacks_stop_where_the_oracle_does(engine: CpuEngine, stop: float | None) -> None:
+def test_tall_stacks_stop_where_the_oracle_does(engine, stop):
     inputs = replace(scenes.stack([0.3, 0.9, 0.999, 0.5] * 90), stop=stop)
     thresholds = torch.linspace(0.01, 0.6, 360)  # more than is staged at once
     expect_oracle(engine, inputs, thresholds)
 
 
 @pytest.mark.parametrize("scene", [scenes.empty(), scenes.behind_camera()])
-def test_nothing_to_draw_leaves_the_background(engine: CpuEngine, scene: RasterInputs) -> None:
+def test_nothing_to_draw_leaves_the_background(engine, scene):
     _, ours, same = draw_pair(engine, scene, None)
     assert same.all()
     assert torch.equal(ours.image, scene.view.background[:, None, None].expand_as(ours.image))
@@ -244,7 +244,7 @@ def test_nothing_to_draw_leaves_the_background(engine: CpuEngine, scene: RasterI
     check_gradients(engine, scene, None, same)
 
 
-def test_changes_in_place_are_noticed(engine: CpuEngine) -> None:
+def test_changes_in_place_are_noticed(engine):
     made, leaves = scenes.leaves(scenes.random_scene(0))
     loss = engine.rasterize(made, None).image.sum()
     with torch.no_grad():
@@ -293,9 +293,7 @@ def awkward_scenes(draw: st.DrawFn) -> tuple[RasterInputs, torch.Tensor | None]:
 
 @settings(max_examples=30)
 @given(case=awkward_scenes())
-def test_awkward_scenes_equal_the_oracle(
-    engine: CpuEngine, case: tuple[RasterInputs, torch.Tensor | None]
-) -> None:
+def test_awkward_scenes_equal_the_oracle(engine, case):
     inputs, thresholds = case
     truth, ours, same = draw_pair(engine, inputs, thresholds)
     away = (truth.radii - ours.radii).abs()
@@ -353,7 +351,7 @@ def opaque_borders(draw: st.DrawFn) -> Drawn:
 
 @settings(max_examples=25)
 @given(case=opaque_borders())
-def test_pixels_stop_alike_on_both_sides_of_a_border(engine: CpuEngine, case: Drawn) -> None:
+def test_pixels_stop_alike_on_both_sides_of_a_border(engine, case):
     truth, ours, same = draw_pair(engine, *case)
     check_images(truth, ours, same)
     # One fragment where the rim's reach ends, 4% of the peak, may count for one engine only.
@@ -377,7 +375,7 @@ def near_the_near_plane(draw: st.DrawFn) -> Drawn:
 
 @settings(max_examples=30)
 @given(case=near_the_near_plane())
-def test_the_near_plane_culls_alike(engine: CpuEngine, case: Drawn) -> None:
+def test_the_near_plane_culls_alike(engine, case):
     truth, ours, same = draw_pair(engine, *case)
     assert torch.equal(truth.radii > 0, ours.radii > 0)
     if not torch.equal(truth.radii, ours.radii):

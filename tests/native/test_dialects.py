@@ -23,7 +23,6 @@ from native.test_against_oracle import (
     projected,
 )
 
-from fragprune_plugins.engines.cpu.engine import CpuEngine
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.types import Compensation, RasterInputs, Rim
 
@@ -58,7 +57,7 @@ def dialects(draw: st.DrawFn) -> Case:
 
 @settings(max_examples=60)
 @given(case=dialects())
-def test_all_mixed_equal_the_oracle(engine: CpuEngine, case: Case) -> None:
+def test_all_mixed_equal_the_oracle(engine, case):
     inputs, thresholds = case
     truth, ours, same = draw_pair(engine, inputs, thresholds)
     if not torch.equal(truth.radii, ours.radii):
@@ -71,7 +70,7 @@ def test_all_mixed_equal_the_oracle(engine: CpuEngine, case: Case) -> None:
         check_scores(truth, ours, same)
 
 
-def test_scores_and_features_change_nothing_else(engine: CpuEngine) -> None:
+def test_scores_and_features_change_nothing_else(engine):
     inputs = scenes.random_scene(4, 200, 61, 43)
     features = torch.rand(200, 5, generator=torch.Generator().manual_seed(0))
     asked = replace(
@@ -92,7 +91,7 @@ def test_scores_and_features_change_nothing_else(engine: CpuEngine) -> None:
         assert torch.equal(grad[..., columns], second[name][..., columns]), name
 
 
-def test_features_without_a_gradient_from_above_get_zeros(engine: CpuEngine) -> None:
+def test_features_without_a_gradient_from_above_get_zeros(engine):
     made, leaves = scenes.leaves(scenes.random_scene(0, features=2))
     engine.rasterize(made, None).image.sum().backward()
     assert leaves["features"].grad is None or not leaves["features"].grad.any()
@@ -100,7 +99,7 @@ def test_features_without_a_gradient_from_above_get_zeros(engine: CpuEngine) -> 
 
 
 @pytest.mark.parametrize("kind", [{}, {"compensation": "mip"}, {"features": 2, "offsets": True}])
-def test_footprints_draw_and_learn_what_the_splats_do(engine: CpuEngine, kind: dict) -> None:
+def test_footprints_draw_and_learn_what_the_splats_do(engine, kind):
     """Projected in torch, drawn by the engine, and back through both."""
     inputs = scenes.random_scene(2, **kind, absolute_gradient=True)
     thresholds = scenes.random_thresholds(2, 60)
@@ -123,7 +122,7 @@ def test_footprints_draw_and_learn_what_the_splats_do(engine: CpuEngine, kind: d
             assert (found[1][name] - expected).abs().max().item() < 1e-3 * scale, name
 
 
-def test_footprints_that_cannot_be_drawn_are_culled(engine: CpuEngine) -> None:
+def test_footprints_that_cannot_be_drawn_are_culled(engine):
     scene = scenes.footprints_of(scenes.stack([0.5] * 9))
     splats = scene.splats
     splats.conics[0, 0] = -1.0
@@ -143,7 +142,7 @@ def test_footprints_that_cannot_be_drawn_are_culled(engine: CpuEngine) -> None:
         assert leaves[name].grad.isfinite().all(), name
 
 
-def test_offsets_beyond_all_bounds_are_refused(engine: CpuEngine) -> None:
+def test_offsets_beyond_all_bounds_are_refused(engine):
     from fragprune_plugins.errors import EngineError
 
     inputs = scenes.random_scene(0)
@@ -155,7 +154,7 @@ def test_offsets_beyond_all_bounds_are_refused(engine: CpuEngine) -> None:
 
 
 @pytest.mark.parametrize("far", [3.0, 40.0])
-def test_offsets_may_reach_far(engine: CpuEngine, far: float) -> None:
+def test_offsets_may_reach_far(engine, far):
     inputs = scenes.random_scene(3, 60, 41, 29, offsets=True)
     inputs = replace(inputs, sample_offsets=inputs.sample_offsets * 2 * far)
     expect_oracle(engine, inputs, None)
@@ -164,9 +163,7 @@ def test_offsets_may_reach_far(engine: CpuEngine, far: float) -> None:
 @pytest.mark.parametrize(
     ("side", "dilation"), [(0.0315, 0.0), (0.0318, 0.0), (0.0589, 0.4), (0.1, 0.1), (0.5, 0.1)]
 )
-def test_mips_small_numbers_count_where_determinants_are_small(
-    engine: CpuEngine, side: float, dilation: float
-) -> None:
+def test_mips_small_numbers_count_where_determinants_are_small(engine, side, dilation):
     scene = scenes.one_splat(sigma=(side, side), opacity=0.99)
     scene = replace(scene, compensation="mip", dilation=dilation)
     found = []

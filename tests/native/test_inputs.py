@@ -89,7 +89,7 @@ CHANGES = [
 
 
 @pytest.mark.parametrize(("kind", "place", "name"), CHANGES)
-def test_every_field_reaches_compiled_code(kind: str, place: str, name: str) -> None:
+def test_every_field_reaches_compiled_code(kind, place, name):
     """A new field fails here until calling.py hands it on, or ``NO_INPUTS`` says why not."""
     inputs = GIVEN[kind]
     owner = getattr(inputs, place) if place else inputs
@@ -98,7 +98,7 @@ def test_every_field_reaches_compiled_code(kind: str, place: str, name: str) -> 
 
 
 @pytest.mark.parametrize("owner", [View, Splats, Footprints, RasterInputs])
-def test_no_field_is_left_out_above(owner: type) -> None:
+def test_no_field_is_left_out_above(owner):
     tried = {
         field.name
         for inputs in GIVEN.values()
@@ -110,9 +110,7 @@ def test_no_field_is_left_out_above(owner: type) -> None:
 
 @pytest.mark.parametrize("flat", [False, True], ids=["ellipsoids", "surfels"])
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_coefficients_in_two_arrays_are_drawn_and_learned_as_those_in_one(
-    library: binding.Library, degree: int, flat: bool
-) -> None:
+def test_coefficients_in_two_arrays_are_drawn_and_learned_as_those_in_one(library, degree, flat):
     """To the bit, and as the oracle has it: it joins them."""
     scene = scenes.random_scene(3, 60, sh_degree=degree, flat=flat)
     one, whole = scenes.leaves(scene)
@@ -130,7 +128,7 @@ def test_coefficients_in_two_arrays_are_drawn_and_learned_as_those_in_one(
     assert torch.allclose(images[1], expected, atol=1e-5)
 
 
-def test_a_struct_has_no_fields_that_c_does_not_know() -> None:
+def test_a_struct_has_no_fields_that_c_does_not_know():
     with pytest.raises(TypeError, match="gamma"):
         binding.Inputs(width=3, gamma=2.2)
 
@@ -158,9 +156,7 @@ THREADS, COEFFICIENTS = "threads must be 1 to 1024", "sh_coefficients must be 0 
         *(({"sh_coefficients": count}, COEFFICIENTS) for count in (-1, 1025, 2**31 - 1)),
     ],
 )
-def test_a_number_that_cannot_be_is_refused(
-    library: binding.Library, given: dict[str, float], said: str
-) -> None:
+def test_a_number_that_cannot_be_is_refused(library, given, said):
     inputs = native_inputs(WORLD, arrays := native_arrays(WORLD, None), widen=False)
     assert len(arrays) > 5  # alive while they are read
     for name, value in given.items():
@@ -171,9 +167,7 @@ def test_a_number_that_cannot_be_is_refused(
 
 
 @pytest.mark.parametrize("kind", GIVEN)
-def test_an_array_of_another_length_is_refused_by_its_name(
-    library: binding.Library, kind: str
-) -> None:
+def test_an_array_of_another_length_is_refused_by_its_name(library, kind):
     inputs = GIVEN[kind]
     arrays = native_arrays(inputs, THRESHOLDS)
     assert draw(library, native_inputs(inputs, arrays, widen=False)) == (binding.OK, "")
@@ -211,14 +205,14 @@ class Doubting:
         assert function(*structs) == binding.OK
 
 
-def test_a_cut_of_arrays_of_another_length_is_refused_by_name(library: binding.Library) -> None:
+def test_a_cut_of_arrays_of_another_length_is_refused_by_name(library):
     blade = Doubting(library)
     splats = spacetime.leaves(spacetime.splats("joint", N), torch.float32)
     slice_by(blade, splats, spacetime.moment()).means.sum().backward()
     assert blade.refused == 2 * 10  # there and back
 
 
-def test_memory_resized_behind_the_checks_is_not_read(engine: CpuEngine) -> None:
+def test_memory_resized_behind_the_checks_is_not_read(engine):
     """Values are checked when they are made; a tensor can be changed in place afterwards."""
     inputs = scenes.random_scene(0, N)
     inputs.splats.opacities.resize_(3)

@@ -35,7 +35,7 @@ RECORDED = {  # millions, of 4,000 Gaussians on 320x320 pixels
 
 
 @pytest.mark.parametrize(("kind", "falloff"), RECORDED)
-def test_no_stage_costs_more_than_is_written_down(kind: str, falloff: float) -> None:
+def test_no_stage_costs_more_than_is_written_down(kind, falloff):
     if re.search(COMPILER, Path(binding.open_build("avx2").path).read_bytes()) is None:
         pytest.skip("this build is not of the compiler that the record is of")
     found = counts(*scene(320, 4000, falloff), kind=kind)
@@ -43,24 +43,24 @@ def test_no_stage_costs_more_than_is_written_down(kind: str, falloff: float) -> 
         assert found[stage] / 1e6 < TOLERANCE * recorded, f"{stage}: {found[stage] / 1e6:.2f}"
 
 
-def test_counts_repeat_exactly() -> None:
+def test_counts_repeat_exactly():
     case = scene(128, 500, 0.12)
     assert counts(*case, kind="all") == counts(*case, kind="all")
 
 
-def test_a_pixel_of_an_empty_picture_costs_three_instructions_at_most() -> None:
+def test_a_pixel_of_an_empty_picture_costs_three_instructions_at_most():
     """One for four numbers of a plane would be 0.75; a background blended anew takes 30."""
     assert counts(*scene(1024, 0))["forward"] / 1024**2 < 3
 
 
-def test_a_plane_that_nobody_asks_for_is_not_paid() -> None:
+def test_a_plane_that_nobody_asks_for_is_not_paid():
     image, whole = (
         counts(*scene(320, 4000, planes=planes))["blend"] for planes in ((), ("invdepth", "alpha"))
     )
     assert image < 0.98 * whole
 
 
-def test_a_large_frame_follows_its_evaluated_pairs() -> None:
+def test_a_large_frame_follows_its_evaluated_pairs():
     plain, cut = (counts(*scene(1024, 10_000, falloff)) for falloff in (0.0, 0.12))
     fewer = plain["evaluated"] / cut["evaluated"]
     assert plain["forward"] / cut["forward"] > 0.85 * fewer

@@ -12,7 +12,7 @@ from torch import inf, nan
 
 from fragprune_plugins.constants import NEUTRAL_LOGIT
 from fragprune_plugins.engines.cpu.engine import CpuEngine
-from fragprune_plugins.types import Compensation, RasterInputs, Rim
+from fragprune_plugins.types import RasterInputs, Rim
 
 # Enough Gaussians and tiles for several pieces of work per thread, in sorting and binning too.
 LARGE = {"n": 20_000, "width": 150, "height": 100, "scale_modifier": 0.3}
@@ -49,7 +49,7 @@ def assert_identical(first: dict[str, torch.Tensor], second: dict[str, torch.Ten
     [{}, {"features": 2, "offsets": True}, {"rim": "soft"}, {"flat": True}],
     ids=["plain", "extras", "soft rim", "surfels"],
 )
-def test_threads_and_runs_do_not_change_a_bit(engine: CpuEngine, kind: dict) -> None:
+def test_threads_and_runs_do_not_change_a_bit(engine, kind):
     inputs = scenes.random_scene(3, **LARGE, **kind, absolute_gradient="features" in kind)
     thresholds = scenes.random_thresholds(3, LARGE["n"])
     alone = everything(engine, inputs, thresholds)
@@ -59,7 +59,7 @@ def test_threads_and_runs_do_not_change_a_bit(engine: CpuEngine, kind: dict) -> 
         assert_identical(alone, everything(engine, inputs, thresholds))
 
 
-def test_two_python_threads_at_once(engine: CpuEngine) -> None:
+def test_two_python_threads_at_once(engine):
     cases = [scenes.random_scene(seed, 400, 60, 50) for seed in range(4)]
     expected = [everything(engine, case, None) for case in cases]
     with ThreadPoolExecutor(2) as pool:
@@ -70,9 +70,7 @@ def test_two_python_threads_at_once(engine: CpuEngine) -> None:
 
 @pytest.mark.parametrize("rim", get_args(Rim))
 @pytest.mark.parametrize("compensation", ["none", "antialiasing"])
-def test_neutral_thresholds_are_no_thresholds(
-    engine: CpuEngine, compensation: Compensation, rim: Rim
-) -> None:
+def test_neutral_thresholds_are_no_thresholds(engine, compensation, rim):
     inputs = scenes.random_scene(5, 200, 70, 50, sh_degree=3, compensation=compensation)
     neutral = torch.sigmoid(torch.full((200,), NEUTRAL_LOGIT))
     found = everything(engine, replace(inputs, rim=rim), neutral)
@@ -81,7 +79,7 @@ def test_neutral_thresholds_are_no_thresholds(
 
 
 @pytest.mark.parametrize("flat", [False, True])
-def test_a_stop_that_no_pixel_reaches_changes_no_bit(engine: CpuEngine, flat: bool) -> None:
+def test_a_stop_that_no_pixel_reaches_changes_no_bit(engine, flat):
     inputs = scenes.random_scene(4, 60, flat=flat)
     faint = replace(inputs.splats, opacities=inputs.splats.opacities * 0.05)
     inputs, tau = replace(inputs, splats=faint), scenes.random_thresholds(4, 60)
@@ -97,9 +95,7 @@ def test_a_stop_that_no_pixel_reaches_changes_no_bit(engine: CpuEngine, flat: bo
         *(("features", poison) for poison in (nan, inf)),
     ],
 )
-def test_a_broken_gaussian_takes_only_itself_along(
-    engine: CpuEngine, field: str, poison: float
-) -> None:
+def test_a_broken_gaussian_takes_only_itself_along(engine, field, poison):
     inputs, absent = scenes.random_scene(1, 40, features=2), scenes.random_scene(1, 40, features=2)
     getattr(inputs.splats, field)[7] = poison
     absent.splats.opacities[7] = 0.0
@@ -114,7 +110,7 @@ def test_a_broken_gaussian_takes_only_itself_along(
             assert not found[name][~others].any(), name
 
 
-def test_gradients_come_in_the_dtype_and_only_where_they_are_wanted(engine: CpuEngine) -> None:
+def test_gradients_come_in_the_dtype_and_only_where_they_are_wanted(engine):
     inputs = scenes.random_scene(0, dtype=torch.float64)
     opacities = inputs.splats.opacities.requires_grad_()
     out = engine.rasterize(inputs, None)
@@ -123,7 +119,7 @@ def test_gradients_come_in_the_dtype_and_only_where_they_are_wanted(engine: CpuE
     assert inputs.splats.means.grad is None
 
 
-def test_subsets_of_gradients_equal_the_whole(engine: CpuEngine) -> None:
+def test_subsets_of_gradients_equal_the_whole(engine):
     inputs = scenes.random_scene(4, 120, 50, 40, sh_degree=2, compensation="antialiasing")
     thresholds = scenes.random_thresholds(4, 120)
     made, leaves = scenes.leaves(inputs)
@@ -137,7 +133,7 @@ def test_subsets_of_gradients_equal_the_whole(engine: CpuEngine) -> None:
         torch.testing.assert_close(alone.grad, leaves[name].grad, rtol=1e-4, atol=1e-4)
 
 
-def test_backward_twice_and_graph_freed(engine: CpuEngine) -> None:
+def test_backward_twice_and_graph_freed(engine):
     made, leaves = scenes.leaves(scenes.random_scene(0))
     loss = engine.rasterize(made, None).image.sum()
     loss.backward(retain_graph=True)
@@ -148,7 +144,7 @@ def test_backward_twice_and_graph_freed(engine: CpuEngine) -> None:
         loss.backward()
 
 
-def test_memory_used_again_holds_nothing_of_its_past(engine: CpuEngine) -> None:
+def test_memory_used_again_holds_nothing_of_its_past(engine):
     inputs = scenes.random_scene(6, 300, 200, 160)  # images large enough for the workspace
     fresh = everything(engine, inputs, None)
     poison = engine.rasterize(scenes.random_scene(7, 900, 210, 160), None)
@@ -158,7 +154,7 @@ def test_memory_used_again_holds_nothing_of_its_past(engine: CpuEngine) -> None:
     assert_identical(fresh, everything(engine, inputs, None))
 
 
-def test_outputs_and_graphs_outlive_their_engine() -> None:
+def test_outputs_and_graphs_outlive_their_engine():
     engine = CpuEngine()
     made, leaves = scenes.leaves(scenes.random_scene(0, 50, 200, 160))
     out = engine.rasterize(made, None)
@@ -169,13 +165,13 @@ def test_outputs_and_graphs_outlive_their_engine() -> None:
     assert leaves["means"].grad.isfinite().all()
 
 
-def test_stages_are_timed(engine: CpuEngine) -> None:
+def test_stages_are_timed(engine):
     out = engine.rasterize(scenes.random_scene(0), None)
     assert list(out.stages) == ["projection", "binning", "blend"]
     assert all(ms > 0 for ms in out.stages.values())
 
 
-def test_double_backward_is_refused(engine: CpuEngine) -> None:
+def test_double_backward_is_refused(engine):
     made, leaves = scenes.leaves(scenes.random_scene(0))
     loss = engine.rasterize(made, None).image.square().sum()
     (grad,) = torch.autograd.grad(loss, leaves["means"], create_graph=True)

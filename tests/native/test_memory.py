@@ -35,14 +35,14 @@ def faults(kinds: str, *mebibytes: int) -> int:
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library")
-def test_steps_that_free_a_model_cost_no_page_faults() -> None:
+def test_steps_that_free_a_model_cost_no_page_faults():
     assert faults("", 20, 16, 5) > 10_000
     assert faults("growing", 20, 16, 5) < 100
     assert faults("of one size", 20, 16, 5) < 100
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library")
-def test_blocks_of_more_than_32_mib_go_back_where_a_model_grows() -> None:
+def test_blocks_of_more_than_32_mib_go_back_where_a_model_grows():
     assert faults("growing", 40, 3) > 10_000
     assert faults("of one size, growing", 40, 3) > 10_000
     assert faults("of one size", 40, 3) < 100

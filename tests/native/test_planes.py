@@ -6,17 +6,12 @@ import pytest
 import scenes
 import torch
 
-from fragprune_plugins.engines.cpu.engine import CpuEngine
-from fragprune_plugins.types import Plane
-
 SIZE = (70, 50)
 
 
 @pytest.mark.parametrize("planes", [(), ("alpha",), ("invdepth",), ("invdepth", "alpha")])
 @pytest.mark.parametrize("kind", [{}, {"features": 2}], ids=["plain", "features"])
-def test_a_plane_that_is_not_asked_for_changes_nothing_else(
-    engine: CpuEngine, planes: tuple[Plane, ...], kind: dict
-) -> None:
+def test_a_plane_that_is_not_asked_for_changes_nothing_else(engine, planes, kind):
     inputs = scenes.random_scene(3, 60, *SIZE, **kind)
     thresholds = scenes.random_thresholds(3, 60)
     whole = engine.rasterize(inputs, thresholds)
@@ -27,7 +22,7 @@ def test_a_plane_that_is_not_asked_for_changes_nothing_else(
         assert torch.equal(getattr(some, name), getattr(whole, name)[: int(name in planes)])
 
 
-def test_gradients_of_the_image_alone_are_the_same(engine: CpuEngine) -> None:
+def test_gradients_of_the_image_alone_are_the_same(engine):
     grads = []
     for planes in ((), ("invdepth", "alpha")):
         made, leaves = scenes.leaves(scenes.random_scene(4, 60, *SIZE))
@@ -38,7 +33,7 @@ def test_gradients_of_the_image_alone_are_the_same(engine: CpuEngine) -> None:
         assert torch.equal(grad, grads[1][name]), name
 
 
-def test_a_picture_that_gets_no_gradients_takes_no_trouble_for_them(engine: CpuEngine) -> None:
+def test_a_picture_that_gets_no_gradients_takes_no_trouble_for_them(engine):
     """A trained model's parameters want some wherever they are drawn; rims need more lanes then."""
     inputs, plain = scenes.random_scene(3, 60, *SIZE), scenes.random_thresholds(3, 60)
     expected = engine.rasterize(inputs, plain).evaluated_per_pixel

@@ -13,7 +13,6 @@ from native.test_inputs import draw
 
 from fragprune_plugins.engines.calling import native_arrays, native_inputs
 from fragprune_plugins.engines.cpu import binding
-from fragprune_plugins.engines.cpu.engine import CpuEngine
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.types import RasterInputs, RasterOutputs
 
@@ -53,9 +52,7 @@ def slopes(
 @pytest.mark.parametrize("truncated", [False, True], ids=["whole", "truncated"])
 @pytest.mark.parametrize("plane", MAPS)
 @pytest.mark.parametrize("made", [lambda: scenes.random_scene(2, flat=True), lambda: sheet(3)])
-def test_each_map_alone_and_its_gradients_equal_the_oracle(
-    engine: CpuEngine, made: Callable[[], RasterInputs], plane: str, truncated: bool
-) -> None:
+def test_each_map_alone_and_its_gradients_equal_the_oracle(engine, made, plane, truncated):
     scene, drawn = made(), MAPS[plane]
     tau = scenes.random_thresholds(2, 60) if truncated else None
     truth, ours, same = draw_pair(engine, scene, tau)
@@ -81,9 +78,7 @@ def test_each_map_alone_and_its_gradients_equal_the_oracle(
     size=st.sampled_from([(1, 1), (7, 33), (17, 15), (35, 21)]),
     truncated=st.booleans(),
 )
-def test_pictures_of_any_size_equal_the_oracle(
-    engine: CpuEngine, seed: int, n: int, size: tuple[int, int], truncated: bool
-) -> None:
+def test_pictures_of_any_size_equal_the_oracle(engine, seed, n, size, truncated):
     scene = scenes.random_scene(seed, n, *size, flat=True)
     truth, ours, same = draw_pair(
         engine, scene, scenes.random_thresholds(seed, n) if truncated else None
@@ -96,7 +91,7 @@ def test_pictures_of_any_size_equal_the_oracle(
     check_images(truth, ours, same, 1e-3)
 
 
-def test_thresholds_spare_what_they_cut_off(engine: CpuEngine) -> None:
+def test_thresholds_spare_what_they_cut_off(engine):
     scene = scenes.random_scene(5, 300, 160, 120, flat=True)
     whole = engine.rasterize(scene, None)
     cut = engine.rasterize(scene, torch.full((300,), 0.5))
@@ -105,7 +100,7 @@ def test_thresholds_spare_what_they_cut_off(engine: CpuEngine) -> None:
     assert cut.entries_per_pixel < 0.8 * whole.entries_per_pixel
 
 
-def test_a_surface_is_drawn_where_it_is_asked_for(engine: CpuEngine) -> None:
+def test_a_surface_is_drawn_where_it_is_asked_for(engine):
     scene = scenes.random_scene(6, 20, flat=True)
     assert engine.rasterize(replace(scene, planes=("alpha",)), None).surface is None
     assert engine.rasterize(replace(scene, planes=("surface",)), None).surface.shape == (6, 28, 40)
@@ -118,7 +113,7 @@ def test_a_surface_is_drawn_where_it_is_asked_for(engine: CpuEngine) -> None:
     [{"features": 2}, {"offsets": True}, {"compensation": "mip"}, {"cov3d": True}, {"rim": "soft"}],
     ids=lambda change: next(iter(change)),
 )
-def test_what_surfels_do_not_have_is_refused_by_compiled_code(change: dict) -> None:
+def test_what_surfels_do_not_have_is_refused_by_compiled_code(change):
     scene = scenes.random_scene(6, 40, **change)
     arrays = native_arrays(scene, None)
     struct = native_inputs(scene, arrays, widen=False)
