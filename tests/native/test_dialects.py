@@ -83,6 +83,8 @@ def test_scores_and_features_change_nothing_else(engine):
     plain, more = engine.rasterize(inputs, None), engine.rasterize(asked, None)
     for name in ("image", "invdepth", "alpha", "radii"):
         assert torch.equal(getattr(plain, name), getattr(more, name)), name
+    alone = replace(inputs, splats=replace(inputs.splats, features=features[:, :1].contiguous()))
+    assert torch.equal(engine.rasterize(alone, None).features, more.features[:1])
     same = torch.ones(43, 61, dtype=torch.bool)
     asked = replace(asked, splats=inputs.splats)
     first, second = (gradients(engine, case, None, same, 0.0) for case in (inputs, asked))
