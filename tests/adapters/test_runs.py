@@ -110,7 +110,7 @@ def test_killed_while_saving_it_starts_again_from_stage_one_and_leaves_nothing(
     killed = Path(shutil.copytree(trained, tmp_path / "killed"))
 
     def die():
-        monkeypatch.setattr(sidecar, "put", lambda *_: signal.raise_signal(signal.SIGKILL))
+        monkeypatch.setattr(sidecar.atomic, "put", lambda *_: signal.raise_signal(signal.SIGKILL))
         run(command(photographs, killed, 10), finetune)
 
     assert ended(die) == -signal.SIGKILL

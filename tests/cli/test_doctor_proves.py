@@ -114,7 +114,7 @@ def host(monkeypatch):
         outputs = CpuEngine().rasterize(dialect.unpack(call), None)
         return outputs.image * factor[0], outputs.radii
 
-    module = stand_ins.rasterizer(PACKAGE, fields, False, draw)
+    module = stand_ins.rasterizer(PACKAGE, fields, draw)
     monkeypatch.setitem(sys.modules, PACKAGE, module)
     return factor, module
 
@@ -139,7 +139,7 @@ def test_a_hosts_rasterizer_that_draws_otherwise_is_named(host):
 
 def test_another_rasterizer_by_the_same_name_is_refused(host):
     fields = ("image_height", "kernel_size")
-    module = stand_ins.rasterizer(PACKAGE, fields, False, None)
+    module = stand_ins.rasterizer(PACKAGE, fields, None)
     host[1].GaussianRasterizationSettings = module.GaussianRasterizationSettings
     peer = peers.peer(PACKAGE)
     (said,) = prove._check(Contestant("host", peer, ours=False), "cpu")["differences"]
