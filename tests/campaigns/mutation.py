@@ -6,6 +6,7 @@ if less than 85 % of any module's were noticed.
 """
 
 import argparse
+import ast
 import json
 import math
 import os
@@ -16,7 +17,7 @@ from collections import Counter
 from pathlib import Path
 
 MADE = Path("mutants")
-PROBE = "fragprune_plugins.files.reading.x_said__mutmut_1"
+SMALL = Path("fragprune_plugins/files/reading.py")
 WANTED = 0.85
 
 # mutmut's exit codes: https://github.com/boxed/mutmut/blob/main/src/mutmut/stats.py
@@ -31,13 +32,22 @@ def main() -> int:
     parser.add_argument("--sample", type=int, default=60, help="mutants of each (60); 0: all")
     parser.add_argument("--seed", type=int, default=0, help="of the sample (0)")
     words = parser.parse_args()
-    mutmut([PROBE])  # makes all of them, where a module has changed
+    mutmut([one_of(SMALL)])  # makes all of them, where a module has changed
     wanted: list[str] = []
     for codes in by_module(words.modules).values():
         mixed = random.Random(words.seed).sample(sorted(codes), len(codes))
         wanted += mixed[: words.sample or None]  # a larger sample has the smaller one
     mutmut(wanted)
     return table(by_module(words.modules))
+
+
+def one_of(file: Path) -> str:
+    """The first mutant of a module's first function, by mutmut's name for it."""
+    functions = (
+        each for each in ast.parse(file.read_text()).body if isinstance(each, ast.FunctionDef)
+    )
+    name = next(each.name for each in functions if not each.decorator_list)
+    return f"{'.'.join(file.with_suffix('').parts)}.x_{name}__mutmut_1"
 
 
 def mutmut(names: list[str]) -> None:

@@ -107,6 +107,14 @@ def test_an_operation_that_did_nothing_changes_nothing(session, trace):
     assert (list(known.views), told(session)) == ([3], [])
 
 
+def test_thresholds_follow_their_rows_to_new_places_and_observers_are_told(session):
+    model, known = follow(session)
+    rows = torch.tensor([4, 0, 2])
+    rearrange(session, model, RowTrace(rows, torch.zeros(3, dtype=torch.bool)), rows)
+    assert torch.equal(known.store.logits, LOGITS[rows])
+    assert told(session) == [("rearrange", 6, 3)]
+
+
 def test_an_operation_whose_rows_nobody_traced_is_refused(session):
     model, _ = follow(session)
     with pytest.raises(AlignmentError, match="host:f: 4 Gaussians"):
