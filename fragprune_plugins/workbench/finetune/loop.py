@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -30,9 +30,6 @@ from fragprune_plugins.types import RasterInputs, RasterOutputs, one_line
 from fragprune_plugins.workbench.finetune.losses import photometric_loss
 from fragprune_plugins.workbench.finetune.processes import Processes, SharedStage
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
-
-if TYPE_CHECKING:
-    from fragprune_plugins.workbench.finetune.resuming import Keeper
 
 # Learning rates at the start of stage 2, the hosts' own; all decay with the opacity's. Positions
 # (times the scene's extent) take a tenth of the hosts' first: a tenth of that held out less, and a
@@ -70,6 +67,16 @@ class FinetuneResult:
     resumed_at: int = 0
 
     __repr__ = one_line
+
+
+class Keeping(Protocol):
+    """Writes the checkpoints of a training."""
+
+    def due(self, step: int) -> bool:
+        """Whether it is time for one after a step."""
+
+    def keep(self, training: Training) -> None:
+        """Write one, between two steps."""
 
 
 class Training:
@@ -155,7 +162,7 @@ class Training:
         """Wall-clock seconds of all steps, also of those before a checkpoint."""
         return time.perf_counter() - self.started
 
-    def learn(self, keeper: Keeper, progress: bool) -> None:
+    def learn(self, keeper: Keeping, progress: bool) -> None:
         """All steps that are not done yet."""
         settings, total = self.settings, self.settings.iterations
         steps = order(self.dataset.train, total, settings.views_per_step, settings.seed)
@@ -199,7 +206,7 @@ class Training:
         """All that learns, by name."""
         return {**self.parameters(), "thresholds": self.stage.store.logits}
 
-    def _step(self, shots: Sequence[Shot], waiting: DeferredSignals, keeper: Keeper) -> None:
+    def _step(self, shots: Sequence[Shot], waiting: DeferredSignals, keeper: Keeping) -> None:
         stage = self.stage
         stage.begin(lambda: torch.sigmoid(self.model.opacity.detach()))
         self._plain_first = not all(map(stage.knows, shots))
