@@ -9,7 +9,7 @@ tell each other figures alone.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -283,12 +283,13 @@ class Shards(Processes):
             )
         super().expect_able(settings)
 
-    def _gradient(self, leaf: Tensor) -> Tensor:
-        """Its own; but one that is not finite is everybody's, as in a sum."""
-        mine = torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
-        told = (0 * mine).sum()  # 0, or NaN
-        self.ranks.sum(told)
-        return mine + told
+    def _told(self, leaves: Sequence[Tensor]) -> list[Tensor]:
+        """0, or NaN for a gradient that is not finite: as in a sum, it is everybody's then."""
+        none = leaves[0].new_zeros(())
+        return [none if each.grad is None else (0 * each.grad).sum() for each in leaves]
+
+    def _gradient(self, leaf: Tensor, total: Tensor) -> Tensor:
+        return total.expand_as(leaf).clone() if leaf.grad is None else leaf.grad + total
 
     def stepped(self, learned: Mapping[str, Tensor], step: int, *, last: bool = False) -> None:
         """Do nothing: no two processes hold the same Gaussian."""

@@ -160,6 +160,8 @@ class Processes:
     ) -> tuple[Tensor, list[bool]]:
         """Make gradients those of all views of a step; tell each process all figures.
 
+        It is one reduction of one tensor.
+
         Args:
             leaves: the tensors that learn. Their gradients are changed in place, and are there
                 afterwards if any process has one.
@@ -169,19 +171,26 @@ class Processes:
         Returns:
             (views, 4) figures of all views; and of each flag, whether any process has it.
         """
-        mine = rows, flags, [leaf.grad is not None for leaf in leaves]
-        drawn, noticed, there = zip(*self.ranks.gather(mine), strict=True)
         table = leaves[0].new_zeros(views, 4)
-        for rank, figures in enumerate(drawn):
-            if figures:
-                table[rank :: self.ranks.size] = table.new_tensor(figures)
-        for leaf, some in zip(leaves, map(any, zip(*there, strict=True)), strict=True):
-            if some:
-                leaf.grad = self._gradient(leaf)
-        return table, list(map(any, zip(*noticed, strict=True)))
+        if rows:
+            table[self.ranks.rank :: self.ranks.size] = table.new_tensor(rows)
+        noticed = table.new_tensor(flags)
+        there = table.new_tensor([leaf.grad is not None for leaf in leaves])
+        *sums, there, noticed, table = self._summed([*self._told(leaves), there, noticed, table])
+        for leaf, total, some in zip(leaves, sums, there.tolist(), strict=True):
+            leaf.grad = self._gradient(leaf, total) if some else None
+        return table, [some > 0 for some in noticed.tolist()]
 
-    def _gradient(self, leaf: Tensor) -> Tensor:
-        """A leaf's gradient, of the views of all processes."""
-        total = torch.zeros_like(leaf) if leaf.grad is None else leaf.grad.contiguous()
-        self.ranks.sum(total)
+    def _told(self, leaves: Sequence[Tensor]) -> list[Tensor]:
+        """What the others are told of each leaf's gradient."""
+        return [torch.zeros_like(each) if each.grad is None else each.grad for each in leaves]
+
+    def _gradient(self, leaf: Tensor, total: Tensor) -> Tensor:
+        """A leaf's gradient, from what all processes told together."""
         return total
+
+    def _summed(self, parts: Sequence[Tensor]) -> list[Tensor]:
+        flat = torch.cat([part.reshape(-1) for part in parts])
+        self.ranks.sum(flat)
+        pieces = flat.split_with_sizes([part.numel() for part in parts])
+        return [piece.view_as(part) for piece, part in zip(pieces, parts, strict=True)]

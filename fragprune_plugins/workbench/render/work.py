@@ -58,7 +58,8 @@ def render(
     film = out.suffix.lower() == ".mp4"
     _expect_place(out, film=film, shard=shard)
     if scene.data is None and not orbit:
-        cameras = _expect_cameras(cameras or opening.cameras_of(model))
+        cameras = cameras or opening.cameras_of(model)
+        _expect_cameras(cameras)
     rasterizer, device = opening.open_engine(engine)
     writable_folder(out.parent if film else out)
     whole = load(model, truncation=not no_truncation, device="cpu" if shard else device)
@@ -80,12 +81,12 @@ def render(
             fragments[index] = float(outputs.fragments_per_pixel)
             return outputs.image
 
-        names = stems([name for name, _ in named])
-        files = [out] if film else [out / f"{name}.png" for name in names]
+        files = [out]
         if film:
             bar = tqdm(range(len(named)), desc="filming", unit="frame", leave=None)
             filming.write_mp4(out, map(draw, bar), FPS)
         else:
+            files = [out / f"{stem}.png" for stem in stems([name for name, _ in named])]
             _save(files, draw, ranks)
         everybody = ranks.gather(fragments)
     if not ranks.first:
@@ -135,7 +136,7 @@ def _expect_place(out: Path, *, film: bool, shard: bool) -> None:
         filming.require_encoder()
 
 
-def _expect_cameras(cameras: Path | None) -> Path:
+def _expect_cameras(cameras: Path | None) -> None:
     if cameras is None:
         raise UsageError(
             "options",
@@ -143,7 +144,6 @@ def _expect_cameras(cameras: Path | None) -> Path:
             "cameras to draw from",
             "Pass --cameras FILE, --data FOLDER or --orbit.",
         )
-    return cameras
 
 
 def _views(
