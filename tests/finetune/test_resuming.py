@@ -9,7 +9,7 @@ import torch
 from finetune import tiny
 from safetensors.torch import save_file
 
-from fragprune_plugins.errors import CheckpointError, OutputError
+from fragprune_plugins.errors import CheckpointError, DivergedError, OutputError
 from fragprune_plugins.learning import schedule
 from fragprune_plugins.learning.goals import Control, Fewer, Portable, Pressure
 from fragprune_plugins.learning.interruption import sigterm_interrupts
@@ -238,6 +238,17 @@ def test_a_full_disk_costs_the_checkpoint_and_not_the_fine_tuning(
     assert result.progress.steps == 4
     assert "no checkpoint was written" in told[0]
     assert "No space left" in told[0]
+
+
+def test_what_is_not_finite_takes_no_checkpoints_place(tmp_path):
+    """A moment can overflow where gradients and parameters are finite."""
+    checkpoints = Checkpoints(tmp_path / "x")
+    good, bad = torch.ones(3), torch.tensor([1.0, torch.inf, 1.0])
+    checkpoints.save({"exp_avg_sq.opacity": good, "curves": bad * torch.nan}, {"done": 4})
+    before = checkpoints.path.read_bytes()
+    with pytest.raises(DivergedError, match=r"exp_avg_sq\.opacity \(1 of 3 rows\)"):
+        checkpoints.save({"exp_avg_sq.opacity": bad}, {"done": 5})
+    assert checkpoints.path.read_bytes() == before
 
 
 def test_time_decides_when_a_checkpoint_is_due(tmp_path):

@@ -23,7 +23,7 @@ from fragprune_plugins.files.atomic import digest, replacing
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.reading import UntrustedFile, parse_json
 from fragprune_plugins.learning.events import StepStats
-from fragprune_plugins.learning.finite import not_finite
+from fragprune_plugins.learning.finite import expect_finite, not_finite
 from fragprune_plugins.learning.plain import numbers_of
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.plugins import hookspecs
@@ -92,7 +92,11 @@ class Checkpoints:
 
         Args:
             values: whatever JSON can hold; floats come back to the bit.
+
+        Raises:
+            DivergedError: a tensor holds NaN or infinity. The one before stays.
         """
+        expect_finite({k: each for k, each in tensors.items() if k != "curves"}, str(self.path))
         content = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
         metadata = {"format": FORMAT, "values": json.dumps(values)}
         try:
