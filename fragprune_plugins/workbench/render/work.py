@@ -58,8 +58,7 @@ def render(
     film = out.suffix.lower() == ".mp4"
     _expect_place(out, film=film, shard=shard)
     if scene.data is None and not orbit:
-        cameras = cameras or opening.cameras_of(model)
-        _expect_cameras(cameras)
+        cameras = _expect_cameras(cameras or opening.cameras_of(model))
     rasterizer, device = opening.open_engine(engine)
     writable_folder(out.parent if film else out)
     whole = load(model, truncation=not no_truncation, device="cpu" if shard else device)
@@ -81,12 +80,12 @@ def render(
             fragments[index] = float(outputs.fragments_per_pixel)
             return outputs.image
 
-        files = [out]
+        names = stems([name for name, _ in named])
+        files = [out] if film else [out / f"{name}.png" for name in names]
         if film:
             bar = tqdm(range(len(named)), desc="filming", unit="frame", leave=None)
             filming.write_mp4(out, map(draw, bar), FPS)
         else:
-            files = [out / f"{stem}.png" for stem in stems([name for name, _ in named])]
             _save(files, draw, ranks)
         everybody = ranks.gather(fragments)
     if not ranks.first:
@@ -136,7 +135,7 @@ def _expect_place(out: Path, *, film: bool, shard: bool) -> None:
         filming.require_encoder()
 
 
-def _expect_cameras(cameras: Path | None) -> None:
+def _expect_cameras(cameras: Path | None) -> Path:
     if cameras is None:
         raise UsageError(
             "options",
@@ -144,6 +143,7 @@ def _expect_cameras(cameras: Path | None) -> None:
             "cameras to draw from",
             "Pass --cameras FILE, --data FOLDER or --orbit.",
         )
+    return cameras
 
 
 def _views(
