@@ -148,11 +148,11 @@ def test_photographs_of_another_scene_are_told_before_the_learning(path, model, 
 ALIKE = {"train": "all", "opacity_lr": None, "seed": 0, "views_per_step": 1}
 
 
-def measured(goal, psnr=30.0, iterations=3, keep=None, adapter=None, **settings):
+def measured(goal, psnr=30.0, iterations=3, keep=None, adapter=None, words=(), **settings):
     """A record's data of a training that began with so many dB."""
     begun = {"views": 2, "gaussians": 60, "psnr": psnr}
     figures = {"before": begun, "after": begun | {"goal": goal}, "iterations": iterations}
-    figures |= {"keep": keep, "adapter": adapter}
+    figures |= {"keep": keep, "adapter": adapter, "host_options": [*words]}
     return figures | {"settings": ALIKE | {"goal": goal} | settings}
 
 
@@ -172,6 +172,8 @@ def measured(goal, psnr=30.0, iterations=3, keep=None, adapter=None, **settings)
         ({"adapter": "vanilla-3dgs"}, {}, False),
         ({"adapter": "vanilla-3dgs"}, {"adapter": "vanilla-3dgs"}, True),
         ({}, {"psnr": 30.1}, False),
+        ({"words": ["--lambda_dssim", "0.5"]}, {}, False),
+        ({"words": ["--eval"]}, {"words": ["--eval"]}, True),
         ({"stop": 0.01}, {"stop": 0.01}, False),
         *(({}, {"stop": stop}, True) for stop in (None, "auto", 0.02)),
     ],
@@ -195,11 +197,11 @@ def test_a_control_truncates_nothing_and_is_quoted_by_the_same_training(words, o
 
 
 def test_a_control_that_ran_after_is_quoted_by_the_finished_command(words, tmp_path):
-    assert "no control was run" in run(*words, 6).stdout
+    assert "no control was found" in run(*words, 6).stdout
     control = run_json(*words, 6, "--control", "--out", tmp_path / "control.ply")
     finished = run(*words, 6).stdout
     assert "was finished before" in finished
-    assert "no control was run" not in finished
+    assert "no control was found" not in finished
     assert "pruning itself makes" in finished
     assert run_json(*words, 6)["control"] == control["after"]
 

@@ -61,7 +61,7 @@ def test_the_line_has_frame_times_and_says_that_no_control_was_run(scene, tmp_pa
     assert result.exit_code == 0, result.stderr
     (line,) = (line for line in result.stdout.splitlines() if "x fewer fragments" in line)
     assert " ms (" in line
-    assert "no control was run; to see, add --stage finetune --control" in line
+    assert "no control was found; to see, add --stage finetune --control" in line
 
 
 def test_a_host_trains_with_the_usual_stop_and_its_model_keeps_it(trained):
@@ -152,6 +152,8 @@ def test_a_control_lies_beside_the_result_and_is_quoted_with_it(folder):
     again = ran(*finetune, "--again", *words)
     assert again["control"] == zero["after"]
     assert "pruning itself makes" in run_json("report", out)["result"]
+    other = ran(*finetune, "--again", *words, "--lambda_dssim", 0.5)
+    assert other["control"] is None  # of another loss
 
 
 @pytest.mark.parametrize("held", [True, False])

@@ -81,7 +81,7 @@ def test_fragments_are_fewer_or_more_or_as_many(was, now, said, figure):
 def test_training_that_had_no_control_is_not_credited_to_pruning(command):
     line = outcome(command, data(), None)
     assert line.startswith(gain(BEFORE, AFTER))
-    assert "More training alone may be a part of the dB: no control was run" in line
+    assert "More training alone may be a part of the dB: no control was found" in line
     assert "--control" in line
 
 

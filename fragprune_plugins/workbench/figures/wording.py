@@ -174,7 +174,7 @@ def outcome(command: str, data: dict[str, Any], control: dict[str, Any] | None) 
         said = f"{gained}. No photograph was used."
     elif control is None:
         said = (
-            f"{gained}. More training alone may be a part of the dB: no control was run; "
+            f"{gained}. More training alone may be a part of the dB: no control was found; "
             f"to see, add {_CONTROL[command]}."
         )
     else:

@@ -8,8 +8,9 @@ from __future__ import annotations
 import contextlib
 import gc
 import logging
+import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -90,7 +91,7 @@ def run(
                     before = first[0] if first else None
             except FragpruneError as error:  # the trained model is saved already
                 not_compared = error
-    data = figures_of(summary, settings, looking, before, after, not_compared)
+    data = figures_of(summary, settings, looking, before, after, not_compared, host_command)
     if summary.steps and summary.model_after:
         read = photographs and photographs.as_dict()
         more = {"curves": summary.curves, "photographs": read}
@@ -119,6 +120,7 @@ def figures_of(
     before: dict[str, Any] | None,
     after: dict[str, Any] | None,
     not_compared: FragpruneError | None = None,
+    host_command: Sequence[str] = (),
 ) -> dict[str, Any]:
     """What --json prints of a run, from its measurements on held-out views."""
     trial = looking.trial
@@ -147,10 +149,18 @@ def figures_of(
         "already_finished": summary.already_finished,
         "seed": settings.seed,
         "settings": summary.settings,
+        "host_options": _options(host_command),
     }
     of_folder = records.files(summary.output, below=True) if summary.output else []
     data["control"] = records.control_of(data, of_folder)
     return data
+
+
+def _options(command: Sequence[str]) -> list[str]:
+    """The words after a host's script that name no file: a control has the same, wherever it is."""
+    scripts = [place for place, word in enumerate(command) if word.endswith(".py")]
+    words = command[scripts[0] + 1 :] if scripts else command
+    return sorted(word for word in words if not os.path.exists(word.rpartition("=")[2]))
 
 
 def _saved(summary: launch.RunSummary) -> str:
