@@ -28,7 +28,7 @@ def test_a_host_run_loads_no_module_of_the_workbench(tmp_path, photographs, pyth
 
 
 def test_the_command_run_loads_of_the_workbench_what_measures_and_tries(python):
-    """Of the slices its own, and the training that is tried before stage 2."""
+    """Of the slices its own, and finetune: tried before stage 2, or what follows a host alone."""
     ours = python(
         "import json, sys\n"
         "import fragprune_plugins.workbench.run.work\n"
@@ -37,4 +37,4 @@ def test_the_command_run_loads_of_the_workbench_what_measures_and_tries(python):
         "print(json.dumps(sorted(names)))"
     )
     measures = {"run", "commands", "figures", "goals", "models", "scenes", "ranks"}
-    assert set(ours) <= measures | {"finetune", "pruning"}
+    assert set(ours) <= measures | {"finetune", "pruning", "distributed", "saved"}

@@ -17,9 +17,9 @@ from fragprune_plugins.hosts.findings import Finding, Plain
 from fragprune_plugins.hosts.preflight import Missing, install, missing_imports
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import proofs
-from fragprune_plugins.plugins import hookspecs
-from fragprune_plugins.plugins.loading import Plugins, Wrong, load_plugins
+from fragprune_plugins.plugins.loading import Plugins, load_plugins
 from fragprune_plugins.workbench.commands.command import Report
+from fragprune_plugins.workbench.saved import models_of
 
 
 def check(*, hosts: tuple[Path, ...], adapter: str | None) -> Report:
@@ -316,7 +316,8 @@ def judge(
     if plain:
         sentence = (
             "No adapter fits, but its PLY is plain 3DGS, and this prunes it: "
-            f"fragprune finetune {_PLY} --data SCENE --out pruned.ply"
+            f"fragprune finetune {_PLY} --data SCENE --out pruned.ply (fragprune run in front of "
+            "its training command does both: it trains as it is, then that follows)"
         )
         return Verdict("finetune", sentence, "", name, differs, inside)
     if inside:
@@ -332,21 +333,6 @@ def judge(
         return Verdict("never", sentence, reason, name, differs)
     reason = f"{plain.folder}/: {plain.reasons[0]}" if plain.folder else plain.reasons[0]
     return Verdict("never", f"Not possible: {reason}.", reason, name, differs)
-
-
-def models_of(repo: HostRepo, plugins: Plugins) -> Sequence[Plain]:
-    """The models that a codebase saves as PLYs, its own first; one without a name if none is known.
-
-    Raises:
-        PluginError: a plugin raised, or answered something else.
-    """
-
-    def wrong(answer: Any) -> Wrong | None:
-        fits = isinstance(answer, list | tuple) and all(isinstance(p, Plain) for p in answer)
-        return None if answer and fits else (repr(answer), "a list of at least one Plain")
-
-    found = plugins.ask(hookspecs.fragprune_read_models, wrong, repo=repo)
-    return found or [Plain(("no plugin reads what it saves",))]
 
 
 def _unproved(repo: HostRepo, fitting: Attempt) -> str:

@@ -64,6 +64,9 @@ def command(**options: Any) -> Report:
     learned so far. If stage 2 was interrupted or killed, the same command begins it anew and does
     not repeat stage 1.
 
+    If no adapter fits the codebase, but the PLY that it saves is plain 3DGS (fragprune check
+    tells), its training runs by itself, and that PLY is then fine-tuned as by fragprune finetune.
+
     \b
     Examples:
       fragprune run -- python train.py -s scene -m out --eval

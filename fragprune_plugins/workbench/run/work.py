@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.errors import FragpruneError, NotComparedError
+from fragprune_plugins.errors import FragpruneError, NotComparedError, UnknownHostError
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.injection import launch
 from fragprune_plugins.injection.process import current_gpu
@@ -35,6 +35,7 @@ from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
 from fragprune_plugins.workbench.finetune.trial import Trial, tried
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.pruning import kept
+from fragprune_plugins.workbench.run.afterwards import Unserved, train_then_finetune, unserved
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
 from fragprune_plugins.workbench.scenes.generated import views_near
 from fragprune_plugins.workbench.scenes.output import saw_all
@@ -81,7 +82,9 @@ def run(
     with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
         warmup = 0 if stage == "joint" else settings.warmup
         with logging_steps([Bar(settings.iterations, warmup)]):
-            summary = launch.run(list(host_command), options)
+            summary = _launched(host_command, options)
+        if isinstance(summary, Unserved):
+            return train_then_finetune(summary, stage, settings, engine, again=again, json=as_json)
         photographs = photographs_of(summary)
         not_compared: FragpruneError | None = summary.not_compared
         if photographs:
@@ -97,6 +100,18 @@ def run(
         more = {"curves": summary.curves, "photographs": read}
         records.leave(summary.model_after, "run", data | more)
     return Report(data, _describe(summary, data, not_compared))
+
+
+def _launched(command: Sequence[str], options: launch.RunOptions) -> launch.RunSummary | Unserved:
+    """The command run under its adapter; what there is to run where none fits."""
+    try:
+        return launch.run(list(command), options)
+    except UnknownHostError:
+        after = options.stage in ("auto", "finetune") and options.from_iter is None
+        host = unserved(command) if after and options.adapter is None else None
+        if host is None:
+            raise
+        return host
 
 
 @contextlib.contextmanager

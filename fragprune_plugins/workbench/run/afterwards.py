@@ -1,0 +1,147 @@
+"""A host that no adapter fits: it trains as it is, and its plain PLY is fine-tuned afterwards."""
+
+from __future__ import annotations
+
+import logging
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from fragprune_plugins.errors import HostFailed, UsageError
+from fragprune_plugins.hosts.choosing import attempt
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.injection.command import split
+from fragprune_plugins.learning.interruption import Terminate, sigterm_interrupts
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.plugins.loading import load_plugins
+from fragprune_plugins.workbench.commands.command import Report
+from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
+from fragprune_plugins.workbench.finetune.work import finetune
+from fragprune_plugins.workbench.saved import models_of
+from fragprune_plugins.workbench.scenes.output import trained_on
+
+log = logging.getLogger("fragprune")
+
+_BY_HAND = "fragprune finetune MODEL.ply --data SCENE --out pruned.ply learns on any that is there."
+
+
+@dataclass(frozen=True)
+class Unserved:
+    """A training command of a codebase that no adapter fits, and whose PLY is plain 3DGS.
+
+    Attributes:
+        program: the words of the command that name what the interpreter runs.
+        arguments: those after them.
+        why: what speaks against the nearest adapter.
+    """
+
+    program: tuple[str, ...]
+    arguments: tuple[str, ...]
+    why: str
+
+    def value(self, *flags: str) -> Path | None:
+        """The path behind one of these flags, the last; None if the command has none of them."""
+        found = None
+        for word, after in zip(self.arguments, (*self.arguments[1:], ""), strict=True):
+            name, equals, value = word.partition("=")
+            if name in flags and (equals or after):
+                found = Path(value if equals else after)
+        return found
+
+    def train(self, *, quietly: bool) -> None:
+        """Run the command in a process of its own; with ``quietly`` it prints to stderr.
+
+        Raises:
+            HostFailed: it ended with an error code.
+        """
+        words = [sys.executable, *self.program, *self.arguments]
+        with sigterm_interrupts(), subprocess.Popen(words, stdout=2 if quietly else None) as host:
+            try:
+                code = host.wait()
+            except KeyboardInterrupt as signal:  # a terminal sends it to the host, too
+                if isinstance(signal, Terminate):
+                    host.terminate()
+                host.wait()
+                raise
+        if code:
+            remedy = "No adapter serves it, so it trains by its own rasterizer alone. Look above."
+            raise HostFailed(self.program[-1], f"exit code {code}", "a training to its end", remedy)
+
+    def saved(self, since: float) -> Path:
+        """The PLY that it wrote last, since a time.
+
+        Raises:
+            HostFailed: there is none.
+        """
+        folder = self.value("-m", "--model_path") or Path("output")
+        found = [each for each in folder.rglob("point_cloud.ply") if each.stat().st_mtime >= since]
+        if not found:
+            what = f"no point_cloud.ply in {folder}" + (" since it began" if since else "")
+            raise HostFailed(self.program[-1], what, "the model that it trained", _BY_HAND)
+        return max(found, key=lambda each: each.stat().st_mtime)
+
+
+def unserved(command: Sequence[str]) -> Unserved | None:
+    """The command, if it trains, no adapter fits its codebase, and that saves plain 3DGS."""
+    script, arguments, module = split(list(command))
+    repo, plugins = HostRepo(script.parent), load_plugins()
+    trains = "train" in script.stem or ".backward(" in repo.read(script)
+    if not trains or not models_of(repo, plugins)[0]:
+        return None
+    tried = attempt(repo, plugins.adapters)
+    if any(each.match.fits for each in tried):
+        return None
+    program = ("-m", module) if module else (str(script),)
+    why = tried[0].brief() if tried else "none is installed"
+    return Unserved(program, tuple(arguments), why)
+
+
+def train_then_finetune(
+    host: Unserved,
+    stage: str,
+    settings: Settings,
+    engine: EngineOptions,
+    *,
+    again: bool,
+    json: bool,
+) -> Report:
+    """Train by the command alone, then do what ``fragprune finetune`` does with its PLY.
+
+    Args:
+        stage: "auto", or "finetune" for a host that has trained already.
+        json: stdout gets our object only.
+    """
+    log.info("no adapter fits (%s), but its PLY is plain 3DGS", host.why)
+    since = 0.0
+    if stage == "auto":
+        since = time.time() - 1  # file systems round
+        log.info("it trains as it is, by itself")
+        host.train(quietly=json)
+    elif host.value("-m", "--model_path") is None:
+        raise UsageError("command", "no -m", "the output folder of the training", "Add -m FOLDER.")
+    model = host.saved(since)
+    out = model.with_name("pruned.ply" if settings.goal.presses else "control.ply")
+    data = None if trained_on(model) else host.value("-s", "--source_path")
+    more = f" --data {data}" if data else ""
+    log.info("its model learns by vanilla 3DGS's drawing and loss, as in")
+    log.info("  fragprune finetune %s%s --out %s", model, more, out)
+    report = finetune(
+        model=model,
+        out=out,
+        itself=False,
+        cameras=None,
+        scene=SceneOptions(data=data),
+        settings=settings,
+        keep=None,
+        seed=settings.seed,
+        shard=False,
+        no_truncation=False,
+        again=again,
+        engine=engine,
+    )
+    assert report is not None
+    host_data = {"adapter": None, "stage": stage, "model_before": str(model)}
+    return replace(report, data=host_data | report.data)

@@ -1,0 +1,113 @@
+"""fragprune run where no adapter fits: the host trains alone, then its plain PLY learns."""
+
+import json
+import os
+import shutil
+
+import pytest
+from cli.commands import fails, run
+from core.test_verdict import fork as fork  # a fixture
+from miniatures.runs import TINY
+from miniatures.vanilla_3dgs import HOST
+
+from fragprune_plugins.files.ply import read_ply
+
+TRAINING = """
+import os, shutil, sys
+
+scene, out = sys.argv[2], sys.argv[4]
+
+
+def save(scene):
+    scene.save(30000)
+
+
+os.makedirs(out + "/point_cloud/iteration_9")
+shutil.copy({model!r}, out + "/point_cloud/iteration_9/point_cloud.ply")
+with open(out + "/cfg_args", "w") as arguments:
+    arguments.write(f"Namespace(eval=True, images='images', model_path={{out!r}}, resolution=1, "
+                    f"sh_degree=1, source_path={{scene!r}}, white_background=False)")
+print("trained as it is")
+sys.exit({code})
+"""
+WORDS = ["--device", "cpu", "--iters", 6]
+
+
+@pytest.fixture(scope="module")
+def trained(photographs, tmp_path_factory):
+    """The PLY of a training of the demo's host."""
+    out = tmp_path_factory.mktemp("trained")
+    words = ["-s", photographs, "-m", out, "--iterations", 10, *TINY]
+    result = run("run", "--stage", "off", "--device", "cpu", "--", HOST / "train.py", *words)
+    assert result.exit_code == 0, result.stderr
+    return out / "point_cloud/iteration_10/point_cloud.ply"
+
+
+@pytest.fixture
+def host(fork, trained, tmp_path):
+    """Writes the fork's train.py, which ends with an exit code; gives the words of its command."""
+
+    def make(photographs, code=0):
+        root = fork(root=tmp_path / "fork").root
+        (root / "train.py").write_text(TRAINING.format(model=str(trained), code=code))
+        return ["--", "python", root / "train.py", "-s", photographs, "-m", tmp_path / "out"]
+
+    return make
+
+
+def test_it_trains_as_it_is_and_its_model_learns_after(host, photographs, tmp_path, capfd):
+    words, folder = host(photographs), tmp_path / "out/point_cloud/iteration_9"
+    result = run("run", "--json", *WORDS, *words)
+    assert result.exit_code == 0, result.stderr
+    assert "trained as it is" in capfd.readouterr().err  # stdout has the object alone
+    data = json.loads(result.stdout)
+    assert data["adapter"] is None
+    assert data["model_before"] == str(folder / "point_cloud.ply")
+    assert read_ply(folder / "pruned.ply").falloff is not None
+    assert read_ply(folder / "point_cloud.ply").falloff is None
+    zero = run("run", "--json", "--stage", "finetune", "--control", *WORDS, *words)
+    assert zero.exit_code == 0, zero.stderr
+    assert read_ply(folder / "control.ply").falloff is None
+    again = run("run", "--json", "--stage", "finetune", "--again", *WORDS, *words)
+    assert json.loads(again.stdout)["control"] == json.loads(zero.stdout)["after"]
+
+
+def test_it_is_said_who_learned(host, photographs, caplog):
+    caplog.set_level("INFO", logger="fragprune")
+    run("run", *WORDS, *host(photographs))
+    assert "no adapter fits (3dgs-fork does not fit" in caplog.text
+    assert "learns by vanilla 3DGS's drawing and loss" in caplog.text
+    assert "fragprune finetune" in caplog.text
+
+
+def test_a_training_that_fails_is_followed_by_nothing(host, photographs, tmp_path):
+    said = ("exit code 3", "No adapter serves it")
+    fails("run", *WORDS, *host(photographs, code=3), says=said, code=1)
+    assert not list(tmp_path.rglob("pruned.ply"))
+
+
+def test_a_model_of_an_earlier_training_is_not_taken_for_this_ones(host, photographs, tmp_path):
+    words = host(photographs)
+    script = words[2]
+    script.write_text(script.read_text().replace("shutil.copy(", "print("))
+    old = tmp_path / "out/point_cloud/iteration_8/point_cloud.ply"
+    old.parent.mkdir(parents=True)
+    shutil.copy(script, old)
+    os.utime(old, (1, 1))
+    fails("run", *WORDS, *words, says="no point_cloud.ply in", code=1)
+
+
+@pytest.mark.parametrize(
+    "more",
+    [("--stage", "joint"), ("--stage", "off"), ("--adapter", "3dgs-fork")],
+    ids=["joint", "off", "an adapter that was named"],
+)
+def test_what_only_an_adapter_can_do_is_refused(more, host, photographs, tmp_path):
+    fails("run", *WORDS, *more, *host(photographs), says="no adapter fits", code=1)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_fork_whose_ply_is_not_plain_is_not_trained(fork, photographs, tmp_path):
+    root = fork(("return self._xyz", "return self._xyz + self.moved")).root
+    command = ["--", root / "train.py", "-s", photographs, "-m", tmp_path / "out"]
+    fails("run", *WORDS, *command, says="no adapter fits", code=1)
