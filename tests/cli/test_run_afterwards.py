@@ -74,7 +74,8 @@ def test_it_trains_as_it_is_and_its_model_learns_after(host, photographs, tmp_pa
 
 def test_it_is_said_who_learned(host, photographs, caplog):
     caplog.set_level("INFO", logger="fragprune")
-    run("run", *WORDS, *host(photographs))
+    result = run("run", *WORDS, *host(photographs))
+    assert "to see, add --stage finetune --control to the same command" in result.stdout
     assert "no adapter fits (3dgs-fork does not fit" in caplog.text
     assert "learns by vanilla 3DGS's drawing and loss" in caplog.text
     assert "fragprune finetune" in caplog.text

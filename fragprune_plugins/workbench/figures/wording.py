@@ -22,7 +22,7 @@ CLAIMED = 2
 FELL = 0.5
 """A loss of PSNR, in dB, that is warned of."""
 
-_CONTROL = {
+CONTROLLED_BY = {
     "run": "--stage finetune --control to the same command",
     "finetune": "--control to the same command, with another --out in the same folder",
 }
@@ -175,7 +175,7 @@ def outcome(command: str, data: dict[str, Any], control: dict[str, Any] | None) 
     elif control is None:
         said = (
             f"{gained}. More training alone may be a part of the dB: no control was found; "
-            f"to see, add {_CONTROL[command]}."
+            f"to see, add {CONTROLLED_BY[command]}."
         )
     else:
         said = (

@@ -19,6 +19,7 @@ from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
+from fragprune_plugins.workbench.figures.wording import CONTROLLED_BY
 from fragprune_plugins.workbench.finetune.work import finetune
 from fragprune_plugins.workbench.saved import models_of
 from fragprune_plugins.workbench.scenes.output import trained_on
@@ -76,7 +77,7 @@ class Unserved:
         Raises:
             HostFailed: there is none.
         """
-        folder = self.value("-m", "--model_path") or Path("output")
+        folder = self.value("-m", "--model_path") or Path.cwd()
         found = [each for each in folder.rglob("point_cloud.ply") if each.stat().st_mtime >= since]
         if not found:
             what = f"no point_cloud.ply in {folder}" + (" since it began" if since else "")
@@ -144,4 +145,5 @@ def train_then_finetune(
     )
     assert report is not None
     host_data = {"adapter": None, "stage": stage, "model_before": str(model)}
-    return replace(report, data=host_data | report.data)
+    text = report.text.replace(CONTROLLED_BY["finetune"], CONTROLLED_BY["run"])
+    return replace(report, data=host_data | report.data, text=text)
