@@ -3,6 +3,9 @@
 import json
 import os
 import shutil
+import signal
+import subprocess
+import sys
 
 import pytest
 from cli.commands import fails, run
@@ -30,6 +33,11 @@ with open(out + "/cfg_args", "w") as arguments:
 print("trained as it is")
 sys.exit({code})
 """
+WAITING = """import os, time
+
+print(os.getpid(), flush=True)
+time.sleep(60)
+import os"""
 WORDS = ["--device", "cpu", "--iters", 6]
 
 
@@ -85,6 +93,26 @@ def test_a_training_that_fails_is_followed_by_nothing(host, photographs, tmp_pat
     said = ("exit code 3", "No adapter serves it")
     fails("run", *WORDS, *host(photographs, code=3), says=said, code=1)
     assert not list(tmp_path.rglob("pruned.ply"))
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_the_training_too(number, code, host, photographs):
+    words = host(photographs)
+    script = words[2]
+    script.write_text(f"{script.read_text()}\n".replace("import os", WAITING, 1))
+    line = [sys.executable, "-m", "fragprune_plugins", "run", *map(str, (*WORDS, *words))]
+    how = {"stdout": subprocess.PIPE, "text": True, "start_new_session": True}
+    with subprocess.Popen(line, **how, preexec_fn=hear_ctrl_c) as run_:
+        pid = int(run_.stdout.readline())
+        os.killpg(run_.pid, number) if number == signal.SIGINT else run_.send_signal(number)
+        assert run_.wait(60) == code
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
+
+
+def hear_ctrl_c():
+    """As at a terminal: a job in the background is started with it ignored."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def test_a_model_of_an_earlier_training_is_not_taken_for_this_ones(host, photographs, tmp_path):
