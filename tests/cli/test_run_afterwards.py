@@ -136,6 +136,11 @@ def test_what_only_an_adapter_can_do_is_refused(more, host, photographs, tmp_pat
     assert not (tmp_path / "out").exists()
 
 
+def test_photographs_that_we_cannot_read_are_said_before_the_training(host, tmp_path):
+    fails("run", *WORDS, *host(tmp_path / "nothing"), says="[dataset]", code=1)
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_fork_whose_ply_is_not_plain_is_not_trained(fork, photographs, tmp_path):
     root = fork(("return self._xyz", "return self._xyz + self.moved")).root
     command = ["--", root / "train.py", "-s", photographs, "-m", tmp_path / "out"]

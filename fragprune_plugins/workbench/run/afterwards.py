@@ -22,6 +22,7 @@ from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOpt
 from fragprune_plugins.workbench.figures.wording import CONTROLLED_BY
 from fragprune_plugins.workbench.finetune.work import finetune
 from fragprune_plugins.workbench.saved import models_of
+from fragprune_plugins.workbench.scenes.dataset import read_scene
 from fragprune_plugins.workbench.scenes.output import trained_on
 
 log = logging.getLogger("fragprune")
@@ -114,9 +115,15 @@ def train_then_finetune(
     Args:
         stage: "auto", or "finetune" for a host that has trained already.
         json: stdout gets our object only.
+
+    Raises:
+        DatasetError: we cannot read its photographs.
+        HostFailed: it ended with an error code, or left no model.
     """
     log.info("no adapter fits (%s), but its PLY is plain 3DGS", host.why)
-    since = 0.0
+    source, since = host.value("-s", "--source_path"), 0.0
+    if source is not None:  # better now than after a training
+        read_scene(source, str(host.value("-i", "--images") or "images"))
     if stage == "auto":
         since = time.time() - 1  # file systems round
         log.info("it trains as it is, by itself")
@@ -125,7 +132,7 @@ def train_then_finetune(
         raise UsageError("command", "no -m", "the output folder of the training", "Add -m FOLDER.")
     model = host.saved(since)
     out = model.with_name("pruned.ply" if settings.goal.presses else "control.ply")
-    data = None if trained_on(model) else host.value("-s", "--source_path")
+    data = None if trained_on(model) else source
     more = f" --data {data}" if data else ""
     log.info("its model learns by vanilla 3DGS's drawing and loss, as in")
     log.info("  fragprune finetune %s%s --out %s", model, more, out)
