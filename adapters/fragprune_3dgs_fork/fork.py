@@ -399,7 +399,7 @@ def _trainings(fork: Fork, module: str) -> tuple[str, str] | None:
 def _bound_at_first(tree: ast.Module) -> tuple[str, str] | None:
     """A name that a function binds only in its first iterations, and where; it reads it later."""
     for function in every(tree, ast.FunctionDef):
-        early = _under(function, r"^iteration (<|<=|==) \d+$")
+        early = _under(function, r"(^|and )iteration (<|<=|==) \d+$")
         bound = [(name, node) for node in nodes(function) for name in _binds(node)]
         first = {name: early[node] for name, node in bound if node in early}
         later = {name for name, node in bound if node not in early}

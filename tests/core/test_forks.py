@@ -564,6 +564,12 @@ NOT_RESUMED = {
         "\n        if iteration < 4:\n            import cv2\n        loss.backward()"
         "\n        cv2.imwrite(name, image)",
     ),
+    "a view of its first iterations": (
+        "\n        loss.backward()",
+        "\n        if iteration > 1:\n            if iteration > 1 and iteration <= 4:"
+        "\n                other = views[0]\n            elif iteration <= 9:"
+        "\n                other = views[1]\n            print(other)\n        loss.backward()",
+    ),
     "several models": ("gaussians = ", "other = GaussianModel(3)\n    gaussians = "),
     "as many as asked for": (
         "    gaussians = GaussianModel(3)\n",
