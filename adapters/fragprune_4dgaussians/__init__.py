@@ -11,6 +11,7 @@ beside it, in ``deformation.pth``.
 
 from __future__ import annotations
 
+import ast
 import os
 from argparse import ArgumentParser
 from dataclasses import dataclass, replace
@@ -18,10 +19,18 @@ from pathlib import Path
 from typing import Any
 
 from fragprune_4dgaussians.config import PythonFile
-from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall, model_seam
+from fragprune_graphdeco import (
+    GraphdecoAdapter,
+    GraphdecoDialect,
+    RasterizerCall,
+    every,
+    model_seam,
+)
 from fragprune_plugins.adapting import (
+    Finding,
     HostCall,
     HostInfo,
+    HostRepo,
     ModelFileError,
     ParamGroup,
     RasterInputs,
@@ -29,6 +38,7 @@ from fragprune_plugins.adapting import (
     SeamCall,
     UntrustedFile,
     UsageError,
+    nodes,
     revised,
 )
 
@@ -131,6 +141,14 @@ class MovingGaussians(GraphdecoAdapter):
         ),
         model_seam(Role.STILL, "prune"),
     )
+
+    def fingerprint(self, repo: HostRepo) -> list[Finding]:
+        """Also that its script trains "fine", to which stage 2 belongs."""
+        tree = repo.tree("train")
+        asked = {inner for each in every(tree, ast.Compare) for inner in nodes(each)}
+        named = {n.value for n in every(tree, ast.Constant) if n not in asked}
+        missing = [] if "fine" in named or tree is None else ["no phase fine in train.py"]
+        return [*super().fingerprint(repo), *self.other_host(repo, missing)]
 
     # -- its command line ------------------------------------------------------------------------
 

@@ -16,6 +16,7 @@ MODEL = "scene/gaussian_model.py"
     ("adapter", "file", "old", "new", "found"),
     [
         ("2dgs", RENDERER, "radii, allmap = Gauss", "radii = Gauss", "gives 2 values"),
+        ("4dgaussians", "train.py", '("fine", ', '("other", ', "no phase fine in train.py"),
         ("light-gaussian", RENDERER, "f_count", "f_counts", "f_counts"),
         ("mcmc", "utils/reloc_utils.py", "compute_relocation", "another", "compute_rel"),
         ("mip-splatting", RENDERER, "subpixel_offset=", "offset=", "kernel_size, offset"),
