@@ -59,6 +59,10 @@ _ADDED = re.compile(r"bg_color|zeros_like\(\w+\)$|\* 0\.0$")
 """What is added to a picture and leaves its Gaussians alone: a background, or zeros."""
 _PICTURES = re.compile(r"mesh_\w+|(?!clamp|use)\w+_(rgb|colou?rs?)")
 """Arguments of a rasterizer that are pictures to blend with its own."""
+_CHANNELS = re.compile(r"feat|sem|lang|obj|mask|label|normal")
+"""In names of values that a rasterizer blends beside the colours."""
+_OTHERS = re.compile(r"^(?!num_|.*(depth|normal|alpha)).*(image|render|rgb|colou?r)")
+"""Names of other pictures that a rasterizer may return before its own."""
 _RASTERIZER = re.compile(r"(self\.)?\w*rasterizer")
 """What drawing functions call a rasterizer that they made."""
 _GSPLAT = {
@@ -227,9 +231,11 @@ def _scales(repo: HostRepo, module: str, name: str) -> Iterator[str]:
     setup = every(repo.function(module, f"{name}.create_from_pcd"), ast.Assign)
     body = getattr(repo.tree(module), "body", ())
     model = (each for each in body if getattr(each, "name", "") == name)
+    joined = " ".join(re.findall(r"\bcat\([\[(](.*?)[\])]", " ".join(map(ast.unparse, setup))))
     for each in (node for part in model for node in every(part, ast.Assign)):
         wide = re.search(r"\.repeat\(1, ([12])\)$", ast.unparse(each.value))
-        if wide and (each in setup or "scal" in ast.unparse(each.targets[0])):
+        target = ast.unparse(each.targets[0])
+        if wide and target not in joined and (each in setup or "scal" in target):
             what = "flat, with two scales" if wide[1] == "2" else "round, with one scale"
             yield f"its Gaussians are {what} ({repo.at(module, each.lineno)})"
             return
@@ -629,11 +635,23 @@ class Drawing:
         yield from self.inputs()
         calls = read_calls(self.repo, self.module, self.function.name)
         names = dict.fromkeys([*arguments(self.call), *(n for each in calls for n in each.given)])
-        if blended := [each for each in names if _PICTURES.fullmatch(each)]:
+        blended = [each for each in names if _PICTURES.fullmatch(each)] or [*self._of_columns()]
+        if blended:
             yield f"its rasterizer also takes {', '.join(blended)}", False
         for made in filter(None, map(self._made_into, pictures(self.function))):
             at = self.repo.at(self.module, made.lineno)
             yield f"its picture is made into {ast.unparse(made)[:60]} ({at})", True
+
+    def _of_columns(self) -> Iterator[str]:
+        """Arguments that further columns of the PLY may be, without channels beside the colours."""
+        home = reading.home_of(self.repo, "scene") or reading.MODEL
+        names = {*_columns(self.repo, home, "GaussianModel")[1]} - _PLAIN
+        further = {each for each in names if not change_of(each)}
+        for name, value in arguments(self.call).items() if further else ():
+            if name not in {*ARGUMENTS, *further} and not _CHANNELS.search(name):
+                roots = (each for each in self._roots(value) if not self._plain(each))
+                if any(each.startswith(f"{self.model}.") for each in roots):
+                    yield name
 
     def _others_first(self) -> Iterator[tuple[str, bool]]:
         """Another picture that the rasterizer returns before the one that counts."""
@@ -641,7 +659,7 @@ class Drawing:
         names = [getattr(e, "id", "") for t in targets for e in getattr(t, "elts", ())]
         shown = {getattr(each, "id", "") for each in pictures(self.function)} & {*names}
         before = names[: min(map(names.index, shown), default=0)]
-        if others := [each for each in before if re.search("image|render|rgb|colou?r", each)]:
+        if others := [each for each in before if _OTHERS.search(each)]:
             yield f"its rasterizer returns another picture first, {others[0]}", False
 
     def _made_into(self, value: ast.expr, seen: tuple[str, ...] = ()) -> ast.expr | None:

@@ -310,6 +310,7 @@ def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):
         ("torch.cat(", "jt.concat("),
         ("= torch.exp", "= jt.exp"),
         ("    image, radii, depth, used = ", "    counts, radii, image, used = "),
+        ("    image, radii, depth, used = ", "    num_rendered, depth_image, image, used = "),
         (CALL, REUSED),
         (CALL, JOINED + CALL),
         (
@@ -322,10 +323,18 @@ def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):
         (END, GSPLAT.format("shs, rasterize_mode='classic', packed=False")),
         (END, CHOSEN.replace("{}", "")),
         (".repeat(1, 3)", "\n        scales = scales if self.round else scales.repeat(1, 3)"),
+        (".repeat(1, 3)", ".repeat(1, 2)\n        scales = torch.cat([scales, thin], dim=-1)"),
     ],
 )
 def test_what_leaves_the_picture_alone_is_plain(fork, old, new):
     assert read_plain(fork((old, new)))
+
+
+def test_values_in_further_columns_that_a_rasterizer_takes_make_another_picture(fork):
+    taken = ("shs=shs, scales", "vi=pc.get_vi, sem=pc.get_vi, shs=shs, scales")
+    assert read_plain(fork(taken))
+    reasons = read_plain(fork(taken, ('"opacity"]', '"opacity", "f_do_0"]'))).reasons
+    assert reasons == ("its rasterizer also takes vi",)
 
 
 def test_positions_that_stand_still_are_no_others(fork):
