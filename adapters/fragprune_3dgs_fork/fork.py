@@ -36,6 +36,8 @@ _CHECKPOINT = re.compile(
 _PROCESSES = re.compile(
     r"\bProcess\((.*\W)?target=|\bmp\.spawn\(|\b(DDP|DistributedDataParallel)\("
 )
+_RESUMES = re.compile(r"^(\w+\.)?(start_)?checkpoint( is not None)?$")
+"""A test for a checkpoint to go on from."""
 _EMPTIES = re.compile(r"\brmtree\(\w+\.model_path")
 """A script that removes its output folder, and with it the checkpoint to resume."""
 STATISTICS = {"oneupSHdegree", "add_densification_stats"}
@@ -488,9 +490,12 @@ def _under(tree: ast.AST, pattern: str, both: bool = False) -> dict[ast.AST, str
     return found
 
 
+@lru_cache(maxsize=256)
 def _while_densifying(tree: ast.AST) -> Collection[ast.AST]:
-    """What a script does only where it asks for ``densify_until_iter``."""
-    return _under(tree, "densify_until_iter").keys()
+    """What a script does only where it asks for ``densify_until_iter``, or has no checkpoint."""
+    new = (each.orelse for each in every(tree, ast.If) if _RESUMES.search(ast.unparse(each.test)))
+    first = {inner for part in new for each in part for inner in nodes(each)}
+    return _under(tree, "densify_until_iter").keys() | first
 
 
 def _in_loop(tree: ast.AST, name: str) -> bool:
@@ -891,22 +896,20 @@ def _uses(fork: Fork, draw: Draw, name: str) -> dict[ast.AST, str]:
     }
     for module, tree in fork.trees.items():
         still = (node for node, method in _method_calls(tree) if method in fork.still)
-        passed = {inner for node in still for inner in nodes(node)} | _only_named(tree)
+        passed = {inner for node in still for inner in nodes(node)}
+        given = {value: to.id for to, value in assigned(tree) if isinstance(to, ast.Name)}
         for node in nodes(tree):
             read = isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Load)
             index = node.slice if read else None  # type: ignore[attr-defined]
             if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "get":
                 index = node.args[0] if node.args else None
-            if getattr(index, "value", None) in keys and keys and node not in passed:
-                if node in fork.optional:
-                    fork.options |= fork.optional[node]
+            if getattr(index, "value", None) not in keys or not keys:
+                continue
+            own = [n for n in every(tree, ast.Name) if n.id == given.get(node)]
+            reads = [n for n in own if isinstance(n.ctx, ast.Load)] if node in given else [node]
+            for each in (n for n in reads if not {n, node} & passed):
+                if optional := fork.optional.get(each, fork.optional.get(node)):
+                    fork.options |= optional
                 else:
-                    places[node] = fork.repo.at(module, node.lineno)  # type: ignore[attr-defined]
+                    places[each] = fork.repo.at(module, each.lineno)  # type: ignore[attr-defined]
     return places
-
-
-def _only_named(tree: ast.AST) -> set[ast.AST]:
-    """Values that a script gives a name, and never reads by it."""
-    read = {n.id for n in every(tree, ast.Name) if not isinstance(n.ctx, ast.Store)}
-    given = ((target, value) for target, value in assigned(tree) if isinstance(target, ast.Name))
-    return {value for target, value in given if target.id not in read}

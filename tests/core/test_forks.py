@@ -278,7 +278,19 @@ SCORES = '\n\ndef scores():\n    return render(view, gaussians, pipe, background
 EARLY = {
     "in the branch": [(THINS, f'            mask = package["hits"] > 0\n{THINS}')],
     "in a function": [(START, SCORES + START), (THINS, f"            mask = scores()\n{THINS}")],
+    "by a name": [
+        ("        loss.back", '        hits, loss = package["hits"], loss\n        loss.back'),
+        (THINS, f"            mask = hits > 0\n{THINS}"),
+    ],
+    "without a checkpoint": [
+        (
+            LOOP,
+            f'    else:\n        seen = render(view, gaussians, pipe, black)["hits"] > 0\n{LOOP}',
+        ),
+        (LOOP, f"        print(seen)\n{LOOP}"),
+    ],
 }
+READ = {"in a function": "scores()", "by a name": "print(hits)"}
 
 
 @pytest.mark.parametrize("where", EARLY)
@@ -288,8 +300,8 @@ def test_a_value_by_which_a_host_densifies_is_not_read_in_stage_2(tmp_path, wher
     warned = [each.found for each in ForkAdapter().match(repo).findings]
     assert "hits, by which it densifies and which only its own rasterizer gives" in warned
     assert read_fork(repo).outputs[PACKAGE][2].role == "unread"
-    use = '        print(package["hits"])\n' if where == "in the branch" else "        scores()\n"
-    later = (STEPS, f"{use}{STEPS}")
+    use = READ.get(where, 'print(package["hits"])')
+    later = (STEPS, f"        {use}\n{STEPS}")
     read = fork(tmp_path / "later", *EARLY[where], later, values="image, radii, hits", kernel=";")
     assert "hits, read in train.py" in errors(read)[0]
 
