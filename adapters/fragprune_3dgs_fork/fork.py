@@ -897,17 +897,18 @@ def _uses(fork: Fork, draw: Draw, name: str) -> dict[ast.AST, str]:
     for module, tree in fork.trees.items():
         still = (node for node, method in _method_calls(tree) if method in fork.still)
         passed = {inner for node in still for inner in nodes(node)}
-        given = {value: to.id for to, value in assigned(tree) if isinstance(to, ast.Name)}
+        named = ((to, value) for to, value in assigned(tree) if isinstance(to, ast.Name))
+        given: dict[ast.AST, str] = {value: to.id for to, value in named}
+        loads = [n for n in every(tree, ast.Name) if isinstance(n.ctx, ast.Load)]
         for node in nodes(tree):
             read = isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Load)
             index = node.slice if read else None  # type: ignore[attr-defined]
             if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "get":
                 index = node.args[0] if node.args else None
-            if getattr(index, "value", None) not in keys or not keys:
+            if getattr(index, "value", None) not in keys or not keys or node in passed:
                 continue
-            own = [n for n in every(tree, ast.Name) if n.id == given.get(node)]
-            reads = [n for n in own if isinstance(n.ctx, ast.Load)] if node in given else [node]
-            for each in (n for n in reads if not {n, node} & passed):
+            own = [n for n in loads if n.id == given[node]] if node in given else [node]
+            for each in (n for n in own if n not in passed):
                 if optional := fork.optional.get(each, fork.optional.get(node)):
                     fork.options |= optional
                 else:

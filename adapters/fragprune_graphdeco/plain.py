@@ -150,12 +150,10 @@ def _models(repo: HostRepo) -> Iterator[tuple[str, str]]:
     """Module and class of each model that saves a PLY, the one that ``scene`` exports first: those
     in ``scene``, or else those that a script trains.
     """
-    files = sorted(each.stem for each in (repo.root / "scene").glob("*.py"))
-    order = ("gaussian", "model")
-    files.sort(key=lambda stem: (*(word not in stem for word in order), len(stem)))
     home = reading.home_of(repo, "scene").removeprefix("scene.")
-    files.sort(key=lambda stem: stem != home)
-    own = [f"scene.{each}" for each in files if each.isidentifier()]
+    stems = [each.stem for each in (repo.root / "scene").glob("*.py") if each.stem.isidentifier()]
+    stems.sort(key=lambda s: (s != home, "gaussian" not in s, "model" not in s, len(s), s))
+    own = [f"scene.{each}" for each in stems]
     found = [*_saving(repo, own, "save_ply")]
     trained = _trained(repo) if not found else []
     setups = [*_saving(repo, trained, "save_ply", "training_setup")]
@@ -378,11 +376,8 @@ def _renderers(repo: HostRepo) -> list[str]:
 def _own_renderers(repo: HostRepo) -> list[str]:
     """The modules of ``gaussian_renderer``."""
     own = "gaussian_renderer"
-    files = (each.stem for each in (repo.root / own).glob("*.py"))
-    stems = sorted(files, key=lambda stem: (stem != "__init__", stem)) or ["__init__"] * (
-        repo.path(own) is not None
-    )
-    return [own if each == "__init__" else f"{own}.{each}" for each in stems]
+    stems = sorted({each.stem for each in (repo.root / own).glob("*.py")} - {"__init__"})
+    return [own] * (repo.path(own) is not None) + [f"{own}.{each}" for each in stems]
 
 
 def _of_drawing(repo: HostRepo, modules: Iterable[str]) -> Iterator[tuple[str, bool]]:
