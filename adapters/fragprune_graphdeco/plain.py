@@ -388,8 +388,7 @@ def _of_drawing(repo: HostRepo, modules: Iterable[str]) -> Iterator[tuple[str, b
     for module in modules:
         functions = _drawing(repo, module)
         named = repo.mentions(_training(repo), [each.name for each in functions])
-        others = [each for each in functions[1:] if each.name.startswith("render")]
-        instead = [each for each in others if each.name in named and "render" not in named]
+        instead = [n for n in functions[1:] if n.name in named and "render" not in named]
         for function in [*functions[:1], *instead[:1]]:
             yield from Drawing(repo, module, function).reasons()
         if functions:
