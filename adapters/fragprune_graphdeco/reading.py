@@ -133,7 +133,8 @@ _ELSEWHERE = re.compile(r"\w+(?:\.\w+)*\.(?:scene(?:\.\w+)*|gaussian_renderer)")
 
 def failing(repo: HostRepo, scripts: Collection[str]) -> list[str]:
     """Why scripts fail or pass all seams by: modules that are imported under other names, which are
-    others to Python; another framework; compiled training; calls that their functions do not take.
+    others to Python; another framework; compiled training; calls that their functions do not take;
+    a PLY that gets its name after it was saved.
     """
     found = [
         f"{path} imports {name}, which is no module of this folder"
@@ -145,6 +146,9 @@ def failing(repo: HostRepo, scripts: Collection[str]) -> list[str]:
         for top in [name.split(".")[0]]
         if _ELSEWHERE.fullmatch(name) and not (repo.path(top) or (repo.root / top).is_dir())
     ][:1]
+    saving = ast.unparse(repo.function("scene", "Scene.save") or ast.Pass())
+    if re.search(r"\b(os\.(replace|rename)|shutil\.move)\(", saving):
+        found.append("Scene.save renames the PLY that it saves, and loses its thresholds")
     for script in scripts:
         tree, home = repo.tree(module_of(script)), home_of(repo, module_of(script))
         found += [f"{script} trains the GaussianModel of {home}"] * (

@@ -26,6 +26,13 @@ MODEL = "scene/gaussian_model.py"
         ("rain-gs", RENDERER, "low_pass=low_pass,\n", "", "takes what hosts share"),
         ("rain-gs", MODEL, "divide_ratio", "ratio", "no divide_ratio"),
         ("rain-gs", "scene/__init__.py", "args_dict", "options", "no args_dict"),
+        (
+            "vanilla-3dgs",
+            "scene/__init__.py",
+            "self.gaussians.save_ply(self._ply(iteration))",
+            "os.rename(self.gaussians.save_ply('.tmp'), self._ply(iteration))",
+            "Scene.save renames the PLY that it saves",
+        ),
         ("rt-4dgs", MODEL, ".flip(1, 2)", "", "axes are not turned round"),
     ],
 )
