@@ -20,7 +20,7 @@ from fragprune_3dgs_fork.rasterizer import (
     meaning,
     only_asks,
 )
-from fragprune_graphdeco import assigned, every, kernels, plain, reading
+from fragprune_graphdeco import assigned, every, kernels, plain, reading, text_of
 from fragprune_plugins.adapting import Finding, Function, HostRepo, is_off, nodes, off_by_default
 
 MODEL, CLASS, RENDERER = reading.MODEL, "GaussianModel", "gaussian_renderer"
@@ -197,7 +197,7 @@ class Fork:
         pairs = [pair for each in own for pair in assigned(each)]
         made = _SET | {to.attr for to, _ in pairs if isinstance(to, ast.Attribute)}
         found: dict[ast.AST, frozenset[str]] = {}
-        if any("setattr(" in ast.unparse(self.tree(each)) for each in self.scripts):
+        if any("setattr(" in text_of(self.tree(each)) for each in self.scripts):
             return found
         known = reading.as_options(self.repo, self.command)
         for tree in self.trees.values():
@@ -294,18 +294,18 @@ def _networks(repo: HostRepo, script: str) -> set[str]:
         and node.name != CLASS
         and not node.bases[1:]
         and not any(getattr(each, "name", "") == "save_ply" for each in node.body)
-        and not any(ast.unparse(each).endswith(CLASS) for each in node.bases)
+        and not any(text_of(each).endswith(CLASS) for each in node.bases)
     }
 
 
 def _check_script(fork: Fork, script: str) -> None:
     """A script trains in this process, and goes backward once in an iteration."""
     tree = fork.tree(script)
-    if _PROCESSES.search(ast.unparse(tree)):
+    if _PROCESSES.search(text_of(tree)):
         found = "it trains in processes of its own"
         fork.refuse("script", script, found, "one process that keeps its files")
     owners = "|".join(map(re.escape, sorted(reading.owners(tree)))) or "-"
-    if copied := re.search(rf"\bdeepcopy\(({owners})\)", ast.unparse(tree)):
+    if copied := re.search(rf"\bdeepcopy\(({owners})\)", text_of(tree)):
         fork.refuse("script", script, f"copies its model, {copied[0]}", "the one that it makes")
     if size := _size(fork.repo, script):
         found = f"draws pictures of another size than the camera's, {size}"
@@ -320,7 +320,7 @@ def _check_script(fork: Fork, script: str) -> None:
         for loop in every(tree, ast.For)
         if any(name == "backward" for _, name in _method_calls(loop))
     ]
-    counted = [each for each in loops if "iterations" in ast.unparse(each.iter)]
+    counted = [each for each in loops if "iterations" in text_of(each.iter)]
     if any(each in nodes(outer)[1:] for each in counted for outer in loops):
         fork.refuse("script", script, "a training in a loop", "one training")
     fork.one_run = fork.one_run or next(_not_resumed(fork.repo, script, tree), "")
@@ -340,7 +340,7 @@ def _size(repo: HostRepo, script: str) -> str:
             passed = reading.passed(call, parameters)
             for parameter in sorted((passed.keys() & read) - cameras):
                 if not is_off(passed[parameter]):
-                    return f"{parameter}={ast.unparse(passed[parameter])}"
+                    return f"{parameter}={text_of(passed[parameter])}"
     return ""
 
 
@@ -351,7 +351,7 @@ def _rests(tree: ast.Module) -> str:
     models = reading.owners(tree)
     parts = _under(tree, r"\biteration\b(?!.*\biterations\b)", both=True)
     called = [n for n, name in _method_calls(tree) if name == "step"]
-    steps = [n for n in called if ast.unparse(n.func).removesuffix(".optimizer.step") in models]
+    steps = [n for n in called if text_of(n.func).removesuffix(".optimizer.step") in models]
     return parts[steps[0]] if steps and parts.keys() >= {*steps} else ""
 
 
@@ -422,7 +422,7 @@ def _binds(node: ast.AST) -> list[str]:
 
 def _not_resumed(repo: HostRepo, script: str, tree: ast.Module) -> Iterator[str]:
     """Why a script cannot resume its own training, or we not read its checkpoints."""
-    methods, text = _methods(repo), ast.unparse(tree)
+    methods, text = _methods(repo), text_of(tree)
     both = ("capture", "restore")
     missing = [name for each in (_mentioned(tree), methods) for name in both if name not in each]
     if missing:
@@ -433,36 +433,36 @@ def _not_resumed(repo: HostRepo, script: str, tree: ast.Module) -> Iterator[str]
     if not _CHECKPOINT.search(text):
         yield f"{script} has checkpoints of another name"
     saved = [node.args[0] for node, name in _method_calls(tree) if name == "save" and node.args]
-    kept = [each for each in saved if "capture()" in ast.unparse(each)]
+    kept = [each for each in saved if "capture()" in text_of(each)]
     if not any(isinstance(each, ast.Tuple) and len(each.elts) == 2 for each in kept):
         yield f"{script} has checkpoints that are not its model and the iteration"
     if bound := _bound_at_first(tree):
         yield f"{script} makes {bound[0]} only where {bound[1]}"
     made = every(tree, ast.Assign)
-    assigned = [(node, ast.unparse(target)) for node in made for target in node.targets]
+    assigned = [(node, text_of(target)) for node in made for target in node.targets]
     read = {
         name: node.lineno
         for node, names in assigned
-        if "load(" in ast.unparse(node.value) and "," in names
+        if "load(" in text_of(node.value) and "," in names
         for name in re.findall(r"\w+", names)
     }
     if any(node.lineno > read.get(name, node.lineno) for node, name in assigned):
         yield f"{script} does not go on at the iteration of its checkpoint"
     capture = methods["capture"]
     taken, state = _taken_back(methods["restore"]), _state(capture)
-    if not any("optimizer.state_dict()" in ast.unparse(each) for each in state):
+    if not any("optimizer.state_dict()" in text_of(each) for each in state):
         yield "its checkpoints have no state of an optimizer"
     fixed = [each for each in state if not isinstance(each, ast.Starred)]
     more = len(state) - len(fixed)
     if taken and not any(n >= len(fixed) if more else n == len(fixed) for n in taken):
         yield f"its restore takes {taken[0]} values, and capture gives {len(state)}"
-    whole = re.findall(r"self\.(\w+)(?=[,)])", ast.unparse(capture))
-    trained = re.findall(r"self\.(\w+)\.parameters\(", ast.unparse(repo.tree(MODEL) or ast.Pass()))
+    whole = re.findall(r"self\.(\w+)(?=[,)])", text_of(capture))
+    trained = re.findall(r"self\.(\w+)\.parameters\(", text_of(repo.tree(MODEL) or ast.Pass()))
     if networks := sorted({*whole} & {*trained}):
         yield f"its checkpoints hold whole networks, {', '.join(networks)}"
     if networks := sorted({*trained} - _mentioned(capture)):
         yield f"its checkpoints lack networks, {', '.join(networks)}"
-    setup = ast.unparse(methods.get("training_setup", ast.Pass()))
+    setup = text_of(methods.get("training_setup", ast.Pass()))
     values = re.findall(r"'params': \[self\.(\w+)\]", setup)
     if lacking := sorted({*values} - _mentioned(capture)):
         yield f"its checkpoints lack {', '.join(lacking)}"
@@ -484,7 +484,7 @@ def _under(tree: ast.AST, pattern: str, both: bool = False) -> dict[ast.AST, str
     """
     found: dict[ast.AST, str] = {}
     for node in every(tree, ast.If):
-        if re.search(pattern, test := ast.unparse(node.test)):
+        if re.search(pattern, test := text_of(node.test)):
             parts = (*node.body, *(node.orelse if both else ()))
             found |= {inner: test for each in parts for inner in nodes(each)}
     return found
@@ -493,7 +493,7 @@ def _under(tree: ast.AST, pattern: str, both: bool = False) -> dict[ast.AST, str
 @lru_cache(maxsize=256)
 def _while_densifying(tree: ast.AST) -> Collection[ast.AST]:
     """What a script does only where it asks for ``densify_until_iter``, or has no checkpoint."""
-    new = (each.orelse for each in every(tree, ast.If) if _RESUMES.search(ast.unparse(each.test)))
+    new = (each.orelse for each in every(tree, ast.If) if _RESUMES.search(text_of(each.test)))
     first = {inner for part in new for each in part for inner in nodes(each)}
     return _under(tree, "densify_until_iter").keys() | first
 
@@ -544,7 +544,7 @@ def _read_methods(fork: Fork) -> None:
     fork.setups = tuple(
         name
         for name, body in methods.items()
-        if "self.optimizer" in {ast.unparse(to) for to, _ in assigned(body)} and name != "__init__"
+        if "self.optimizer" in {text_of(to) for to, _ in assigned(body)} and name != "__init__"
     )
     loops = [each for s in fork.scripts for each in nodes(fork.tree(s)) if _is_loop(each)]
     trained = {name for each in loops for _, name in _method_calls(each)}
@@ -556,7 +556,7 @@ def _read_methods(fork: Fork) -> None:
         for node, name in _method_calls(tree):
             if name in changing:
                 still |= {name}
-                owner = ast.unparse(node.func.value)  # type: ignore[attr-defined]
+                owner = text_of(node.func.value)  # type: ignore[attr-defined]
                 own = _MODELS.search(owner) or owner.split("[")[0] in owners
                 if own and node in fork.optional and node not in statements:
                     fork.options |= fork.optional[node]
@@ -567,7 +567,7 @@ def _read_methods(fork: Fork) -> None:
                     fork.refuse("row-change", at, f"reads what {name} returns", "a statement")
     fork.still = tuple(name for name in methods if name in still)
     keeps = methods.get("_prune_optimizer")
-    if keeps is not None and "[mask]" not in ast.unparse(keeps):
+    if keeps is not None and "[mask]" not in text_of(keeps):
         place = fork.repo.place(MODEL, f"{CLASS}._prune_optimizer")
         found = "_prune_optimizer keeps other rows than its mask's"
         fork.refuse("row-change", place, found, "[mask]")
@@ -578,7 +578,7 @@ def plain_distances(repo: HostRepo) -> bool:
     tree = repo.tree(MODEL)
     taken = [each.value for each in every(tree, ast.Subscript)]
     taken += [value for target, value in assigned(tree) if isinstance(target, ast.Tuple)]
-    return not any(ast.unparse(each).startswith("distCUDA2(") for each in taken)
+    return not any(text_of(each).startswith("distCUDA2(") for each in taken)
 
 
 def _state(capture: Function) -> list[ast.expr]:
@@ -604,11 +604,11 @@ def _assigned(body: ast.AST, owner: str = "") -> Iterator[tuple[ast.AST, str]]:
             targets = node.targets
         elif isinstance(node, ast.AugAssign | ast.AnnAssign):
             targets = [node.target]
-        elif isinstance(node, ast.Call) and _IN_PLACE.fullmatch(ast.unparse(node.func)):
+        elif isinstance(node, ast.Call) and _IN_PLACE.fullmatch(text_of(node.func)):
             targets = [node.func.value]  # type: ignore[attr-defined]
         for target in targets:
             for each in target.elts if isinstance(target, ast.Tuple) else [target]:
-                found = _PARAMETER.fullmatch(ast.unparse(each))
+                found = _PARAMETER.fullmatch(text_of(each))
                 if found and owner in ("", found[1]):
                     yield node, found[2]
 
@@ -630,13 +630,13 @@ def _read_changes(fork: Fork) -> None:
         trained, module = fork.tree(script), reading.module_of(script)
         owners = reading.owners(trained)
         for node in nodes(trained):
-            if isinstance(node, ast.Assign) and _OPTIMIZER.match(ast.unparse(node.value)):
-                name = ast.unparse(node.targets[0])
-            elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("optimizer.step"):
-                name = ast.unparse(node.func).removesuffix(".step")
+            if isinstance(node, ast.Assign) and _OPTIMIZER.match(text_of(node.value)):
+                name = text_of(node.targets[0])
+            elif isinstance(node, ast.Call) and text_of(node.func).endswith("optimizer.step"):
+                name = text_of(node.func).removesuffix(".step")
                 owner = name.rpartition(".")[0]
                 if len(node.args) == 1:  # two are those of a sparse Adam
-                    found = f"another optimizer, {ast.unparse(node)[:60]}"
+                    found = f"another optimizer, {text_of(node)[:60]}"
                     fork.refuse("optimizer", fork.repo.at(module, node.lineno), found, "step()")
                 if _MODELS.search(owner) or owner.split("[")[0] in {"", *owners}:
                     continue
@@ -644,7 +644,7 @@ def _read_changes(fork: Fork) -> None:
                 continue
             at = fork.repo.at(module, node.lineno)
             fork.warn("optimizer", at, f"stage 2 does not freeze what {name} of {script} trains")
-            if f"{name}.load_state_dict(" not in ast.unparse(trained):
+            if f"{name}.load_state_dict(" not in text_of(trained):
                 fork.one_run = fork.one_run or f"{script} does not resume what {name} trains"
 
 
@@ -652,14 +652,12 @@ def _noisy(tree: ast.AST) -> set[ast.AST]:
     """What adds a product with the rate of positions to them, as MCMC adds its noise."""
     made: dict[str, list[ast.expr]] = {}
     for to, value in assigned(tree):
-        made.setdefault(ast.unparse(to), []).append(value)
-    rates = [
-        to for to, (value, *_) in made.items() if ".update_learning_rate(" in ast.unparse(value)
-    ]
+        made.setdefault(text_of(to), []).append(value)
+    rates = [to for to, (value, *_) in made.items() if ".update_learning_rate(" in text_of(value)]
 
     def product(value: ast.expr) -> bool:
         """Whether a rate is a factor."""
-        return ast.unparse(value) in rates or (
+        return text_of(value) in rates or (
             isinstance(value, ast.BinOp)
             and isinstance(value.op, ast.Mult)
             and (product(value.left) or product(value.right))
@@ -739,9 +737,9 @@ def _read_draws(fork: Fork) -> None:
             made = source.values.get(getattr(blended, "id", ""), [])
             filled = {getattr(each.value, "id", "") for each in every(body, ast.Subscript)}
             if getattr(blended, "id", "") not in filled and any(
-                re.search(r"torch\.(zeros|empty)\(", ast.unparse(each)) for each in made
+                re.search(r"torch\.(zeros|empty)\(", text_of(each)) for each in made
             ):
-                found = f"{ast.unparse(blended or ast.Pass())}, which is empty unless asked for"
+                found = f"{text_of(blended or ast.Pass())}, which is empty unless asked for"
                 fork.refuse("rasterizer-call", at, found, "channels of every Gaussian")
         for node in nodes(body) if name in called else ():
             if isinstance(node, ast.Call) and "means3D" in plain.arguments(node):
@@ -749,7 +747,7 @@ def _read_draws(fork: Fork) -> None:
                 for found in (why for why, moves in other.shapes() if not moves):
                     fork.refuse("rasterizer-call", at, found, "the model's own Gaussians")
         for cut in [*source.cuts()][:1]:
-            found = f"a picture of more channels, {ast.unparse(cut)}"
+            found = f"a picture of more channels, {text_of(cut)}"
             fork.refuse("rasterizer-call", at, found, "a picture")
         if selected := source.selection():
             fork.refuse("rasterizer-call", at, f"draws a selection, {selected}", "all rows")

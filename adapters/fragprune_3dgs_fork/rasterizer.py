@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import fragprune_graphdeco as graphdeco
-from fragprune_graphdeco import assigned, every, kernels
+from fragprune_graphdeco import assigned, every, kernels, text_of
 from fragprune_plugins.adapting import HostRepo, is_off
 
 Sum = Literal["count", "weight"]
@@ -230,15 +230,15 @@ def _reads(function: ast.FunctionDef, setting: str) -> bool:
 
 def _changed(forward: ast.FunctionDef, backward: ast.FunctionDef) -> frozenset[str] | None:
     """Parameters of ``forward`` whose gradients are not what the kernels gave."""
-    made = {to: value for to, value in assigned(backward) if "_backward(" in ast.unparse(value)}
+    made = {to: value for to, value in assigned(backward) if "_backward(" in text_of(value)}
     given = {getattr(each, "id", "") for to in made for each in getattr(to, "elts", [to])}
     changed = [to for to, _ in assigned(backward) if to not in made]
     changed += [each.target for each in every(backward, ast.AugAssign)]
-    given -= {ast.unparse(each).split("[")[0] for each in changed}
+    given -= {text_of(each).split("[")[0] for each in changed}
     last = backward.body[-1]
     returned = last.value if isinstance(last, ast.Return) else None
     if isinstance(returned, ast.Name):
-        values = (value for to, value in assigned(backward) if ast.unparse(to) == returned.id)
+        values = (value for to, value in assigned(backward) if text_of(to) == returned.id)
         returned = next(values, None)
     if not isinstance(returned, ast.Tuple):
         return None

@@ -40,6 +40,7 @@ from fragprune_graphdeco.kernels import SURFEL as SURFEL
 from fragprune_graphdeco.plain import read_models
 from fragprune_graphdeco.reading import assigned as assigned
 from fragprune_graphdeco.reading import every as every
+from fragprune_graphdeco.reading import text_of as text_of
 from fragprune_plugins.adapting import HostRepo, Plain, hookimpl
 
 

@@ -26,6 +26,7 @@ from fragprune_graphdeco.reading import (
     module_of,
     read_flags,
     read_getters,
+    text_of,
     training_scripts,
 )
 from fragprune_plugins.adapting import (
@@ -496,7 +497,7 @@ class GraphdecoAdapter(ScriptAdapter):
         """What of a command our readers would draw otherwise."""
         flags = (flag for flag in self.undrawn_flags if flag in arguments)
         projection = repo.function("utils.graphics_utils", "getProjectionMatrix")
-        pinhole = projection is None or "[3, 2]" in ast.unparse(projection)
+        pinhole = projection is None or "[3, 2]" in text_of(projection)
         other = [] if pinhole else ["its getProjectionMatrix, which is no pinhole camera's"]
         return [f"{flag}, which our readers do not support" for flag in flags] + other
 

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
-from fragprune_graphdeco.reading import assigned, every
+from fragprune_graphdeco.reading import assigned, every, text_of
 from fragprune_plugins.adapting import Function, HostRepo, nodes
 
 SETTINGS, RASTERIZER = "GaussianRasterizationSettings", "GaussianRasterizer"
@@ -79,7 +79,7 @@ class CallInSource(RasterizerCall):
     def other_matrix(self) -> str:
         """What it passes as the projection, if that is called by another name; "" if not."""
         matrix = self.given.get("projmatrix")
-        text = ast.unparse(matrix) if isinstance(matrix, ast.Attribute) else ""
+        text = text_of(matrix) if isinstance(matrix, ast.Attribute) else ""
         return "" if re.search("proj|full|mvp", text) else text
 
     def __str__(self) -> str:
@@ -186,10 +186,10 @@ def _taken(body: Function, whole: str) -> tuple[str, ...]:
                 taken.setdefault(number, set()).add(name)
         for each in every(node.value, ast.Subscript):
             index = getattr(each.slice, "value", None)
-            if type(index) is int and ast.unparse(each.value) == whole:
+            if type(index) is int and text_of(each.value) == whole:
                 taken.setdefault(index, set()).add(getattr(target, "id", ""))
                 known += 1
-    lengths = sum(ast.unparse(each) == f"len({whole})" for each in nodes(body))
+    lengths = sum(text_of(each) == f"len({whole})" for each in nodes(body))
     reads = [each for each in every(body, ast.Name) if each.id == whole]
     stored = sum(isinstance(each.ctx, ast.Store) for each in reads)
     if known + lengths + stored != len(reads) or any(len(each) > 1 for each in taken.values()):

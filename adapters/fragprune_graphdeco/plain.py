@@ -28,6 +28,7 @@ from fragprune_graphdeco.reading import (
     passed,
     returns,
     skipped,
+    text_of,
 )
 from fragprune_plugins.adapting import (
     Function,
@@ -229,18 +230,18 @@ def _scales(repo: HostRepo, module: str, name: str) -> Iterator[str]:
     setup = every(repo.function(module, f"{name}.create_from_pcd"), ast.Assign)
     body = getattr(repo.tree(module), "body", ())
     model = (each for each in body if getattr(each, "name", "") == name)
-    joined = " ".join(re.findall(r"\bcat\([\[(](.*?)[\])]", " ".join(map(ast.unparse, setup))))
+    joined = " ".join(re.findall(r"\bcat\([\[(](.*?)[\])]", " ".join(map(text_of, setup))))
     for each in (node for part in model for node in every(part, ast.Assign)):
-        wide = re.search(r"\.repeat\(1, ([12])\)$", ast.unparse(each.value))
-        target = ast.unparse(each.targets[0])
+        wide = re.search(r"\.repeat\(1, ([12])\)$", text_of(each.value))
+        target = text_of(each.targets[0])
         if wide and target not in joined and (each in setup or "scal" in target):
             what = "flat, with two scales" if wide[1] == "2" else "round, with one scale"
             yield f"its Gaussians are {what} ({repo.at(module, each.lineno)})"
             return
-    stored = [each.value for each in setup if ast.unparse(each.targets[0]) == "self._scaling"]
+    stored = [each.value for each in setup if text_of(each.targets[0]) == "self._scaling"]
     names = {node.id for each in stored for node in every(each, ast.Name)}
     made = [each for each in setup if getattr(each.targets[0], "id", "") in names]
-    if made and all(ast.unparse(each.value).endswith("[..., None]") for each in made):
+    if made and all(text_of(each.value).endswith("[..., None]") for each in made):
         yield f"its Gaussians are round, with one scale ({repo.at(module, made[0].lineno)})"
 
 
@@ -251,7 +252,7 @@ def _of_saving(repo: HostRepo, module: str, name: str) -> Iterator[str]:
     for node in every(function, ast.Assign):
         if not isinstance(node.targets[0], ast.Name):
             continue
-        target, value = node.targets[0].id, ast.unparse(node.value)
+        target, value = node.targets[0].id, text_of(node.value)
         at = repo.at(module, node.lineno)
         for kind in raw:
             if re.search(rf"self\.get_{kind}\b", value) and not isinstance(node.value, ast.Compare):
@@ -270,7 +271,7 @@ def _of_saving(repo: HostRepo, module: str, name: str) -> Iterator[str]:
                 yield f"save_ply stores a product or sum, {target} = {value[:60]} ({at})"
     setup = repo.function(module, f"{name}.setup_functions")
     for node in every(setup, ast.Assign):
-        attribute, value = getattr(node.targets[0], "attr", ""), ast.unparse(node.value)
+        attribute, value = getattr(node.targets[0], "attr", ""), text_of(node.value)
         expected = ACTIVATIONS.get(attribute, (value,))
         if value not in expected and raw.get(attribute.removesuffix("_activation"), True):
             yield f"its {attribute} is {value[:50]} ({repo.at(module, node.lineno)})"
@@ -278,7 +279,7 @@ def _of_saving(repo: HostRepo, module: str, name: str) -> Iterator[str]:
 
 def _of_getters(repo: HostRepo, module: str, name: str) -> Iterator[tuple[str, bool]]:
     """Getters of other values than the PLY's; true if only where an attribute was set later."""
-    saved = ast.unparse(repo.function(module, f"{name}.save_ply") or ast.Pass())
+    saved = text_of(repo.function(module, f"{name}.save_ply") or ast.Pass())
     if repo.function(module, f"{name}.get_xyz") is None:  # a class that only saves
         module, name = reading.MODEL, "GaussianModel"
     off = reading.unset(repo, module, name)
@@ -293,8 +294,8 @@ def _of_getters(repo: HostRepo, module: str, name: str) -> Iterator[tuple[str, b
 def _of_positions(repo: HostRepo, module: str, name: str) -> Iterator[str]:
     """Positions that no optimizer moves: something else makes them for every picture."""
     setup = repo.function(module, f"{name}.training_setup")
-    trained = " ".join(map(ast.unparse, reading.entries(setup, "params")))
-    created = ast.unparse(repo.function(module, f"{name}.create_from_pcd") or ast.Pass())
+    trained = " ".join(map(text_of, reading.entries(setup, "params")))
+    created = text_of(repo.function(module, f"{name}.create_from_pcd") or ast.Pass())
     fixed = re.search(r"self\._xyz = .*requires_grad_\(False\)", created)
     if "self._opacity" in trained and not (fixed or re.search(r"self\._xyz\b", trained)):
         at = repo.place(module, f"{name}.training_setup")
@@ -325,13 +326,13 @@ def _of_sums(repo: HostRepo, script: str) -> Iterator[str]:
     """A picture that a training script adds up of several drawings."""
     tree = repo.tree(script)
     parts = ((to, made) for to, made in assigned(tree) if isinstance(made, ast.Subscript))
-    drawn = {ast.unparse(to) for to, made in parts if ast.unparse(made.slice) == "'render'"}
+    drawn = {text_of(to) for to, made in parts if text_of(made.slice) == "'render'"}
     for node in every(tree, ast.BinOp):
         if isinstance(node.op, ast.Add):
             sides = [_terms(each) & drawn for each in (node.left, node.right)]
             if all(sides) and sides[0] != sides[1]:
                 at = repo.at(script, node.lineno)
-                yield f"its script adds several pictures, {ast.unparse(node)[:60]} ({at})"
+                yield f"its script adds several pictures, {text_of(node)[:60]} ({at})"
                 return
 
 
@@ -339,7 +340,7 @@ def _terms(node: ast.expr) -> set[str]:
     """The names that a sum or product is made of, without those in calls."""
     if isinstance(node, ast.BinOp):
         return _terms(node.left) | _terms(node.right)
-    return {ast.unparse(node)}
+    return {text_of(node)}
 
 
 def _training(repo: HostRepo) -> list[str]:
@@ -434,9 +435,9 @@ def arguments(call: ast.AST | None) -> dict[str, ast.expr]:
     if not isinstance(call, ast.Call):
         return {}
     given = passed(call, ())
-    if ast.unparse(call.func).split(".")[-1] == "rasterization":
+    if text_of(call.func).split(".")[-1] == "rasterization":
         return {_GSPLAT.get(name, name): value for name, value in passed(call, _GSPLAT).items()}
-    drawn = "opacities" in given or _RASTERIZER.fullmatch(ast.unparse(call.func))
+    drawn = "opacities" in given or _RASTERIZER.fullmatch(text_of(call.func))
     return passed(call, ARGUMENTS) if drawn else given
 
 
@@ -518,7 +519,7 @@ class Drawing:
     def _known(self, node: ast.AST) -> list[None]:
         """None for arguments that are off, and for attributes that nobody sets."""
         off = isinstance(node, ast.Name) and node.id in self.off
-        return [None] if off or _never_set(self.repo, ast.unparse(node)) else []
+        return [None] if off or _never_set(self.repo, text_of(node)) else []
 
     def _collect(self, body: list[ast.stmt]) -> None:
         """Note what every name is made of, except where an argument is needed that is off."""
@@ -557,7 +558,7 @@ class Drawing:
         if option in ("", "convert_SHs_python"):
             return False
         values = list(defaults(self.repo, "arguments", option))
-        made = any(ast.unparse(each).startswith("colors_precomp = ") for each in node.body)
+        made = any(text_of(each).startswith("colors_precomp = ") for each in node.body)
         self.colours |= {option} if made and values and all(map(is_off, values)) else set()
         return option in self.colours
 
@@ -600,7 +601,7 @@ class Drawing:
         body = method.body[-1] if method and len(method.body) == 1 else None
         value = body.value if isinstance(body, ast.Return) else None
         given = value.elts if isinstance(value, ast.Tuple) else []
-        own = [each.attr for each in given if re.fullmatch(r"self\.\w+", ast.unparse(each))]  # type: ignore[attr-defined]
+        own = [each.attr for each in given if re.fullmatch(r"self\.\w+", text_of(each))]  # type: ignore[attr-defined]
         return own if own and len(own) == len(given) else [name]
 
     def selection(self) -> str:
@@ -616,13 +617,13 @@ class Drawing:
                     index = node.slice
                     first = index.elts[0] if isinstance(index, ast.Tuple) and index.elts else index
                     if not isinstance(first, ast.Slice | ast.Constant):
-                        return ast.unparse(node)[:60]
+                        return text_of(node)[:60]
         return ""
 
     def reasons(self) -> Iterator[tuple[str, bool]]:
         """Why the picture is not that of the PLY, and whether its rows are drawn all the same."""
         cuts = list(self.cuts())
-        if cuts and not any(re.search(r"\[0?:3[,\]]", ast.unparse(each)) for each in cuts):
+        if cuts and not any(re.search(r"\[0?:3[,\]]", text_of(each)) for each in cuts):
             cut = self.repo.at(self.module, cuts[0].lineno)
             yield f"its picture is cut out of a tensor with further channels ({cut})", False
         yield from self._others_first()
@@ -634,7 +635,7 @@ class Drawing:
             yield f"its rasterizer also takes {', '.join(blended)}", False
         for made in filter(None, map(self._made_into, pictures(self.function))):
             at = self.repo.at(self.module, made.lineno)
-            yield f"its picture is made into {ast.unparse(made)[:60]} ({at})", True
+            yield f"its picture is made into {text_of(made)[:60]} ({at})", True
 
     def _of_columns(self) -> Iterator[str]:
         """Arguments that further columns of the PLY may be, without channels beside the colours."""
@@ -665,10 +666,10 @@ class Drawing:
                 value = value.args[0]
                 continue
             if not isinstance(method, ast.Attribute) or method.attr not in _KEEPS:
-                return None if ast.unparse(method).startswith("bg_color.") else whole
-            value = value.args[0] if ast.unparse(method.value) == "torch" else method.value
+                return None if text_of(method).startswith("bg_color.") else whole
+            value = value.args[0] if text_of(method.value) == "torch" else method.value
         if isinstance(value, ast.BinOp):
-            behind = isinstance(value.op, ast.Add) and _ADDED.search(ast.unparse(value.right))
+            behind = isinstance(value.op, ast.Add) and _ADDED.search(text_of(value.right))
             return self._made_into(value.left, seen) if behind else whole
         name = getattr(value, "id", "")
         others = self.values.get(name, []) if name not in seen else []
@@ -698,7 +699,7 @@ class Drawing:
             yield f"{self.function.name} makes colours from {', '.join(others[:4])} ({at})", False
         for name, usual in _USUAL.items():
             if name in given and getattr(given[name], "value", None) != usual:
-                how = f"{name}={ast.unparse(given[name])}, not {usual!r}"
+                how = f"{name}={text_of(given[name])}, not {usual!r}"
                 yield f"{self.function.name} draws with {how} ({at})", False
         yield from self._of_colours(given)
 
@@ -722,7 +723,7 @@ class Drawing:
         roots = dict.fromkeys(root for each in self._channels(value) for root in self._roots(each))
         others = [each for each in roots if not self._plain(each)]
         if isinstance(value, ast.Call):
-            others = [ast.unparse(value)]
+            others = [text_of(value)]
         if others:
             at = self.repo.at(self.module, value.lineno)
             own = any(each.startswith(f"{self.model}.get_features") for each in roots)

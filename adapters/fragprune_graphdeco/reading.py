@@ -53,9 +53,9 @@ def read_getters(repo: HostRepo, module: str, unset: Collection[str] = ()) -> li
         decorators = function.decorator_list if function else []
         if kind in computed:
             made = (each.value for each in every(function, ast.Return))
-            ends = " or ".join(ast.unparse(each) for each in made if each)
+            ends = " or ".join(text_of(each) for each in made if each)
             what = f"get_{kind} is computed, it returns {ends[:60] or 'nothing'}"
-        elif read and not any("property" in ast.unparse(each) for each in decorators):
+        elif read and not any("property" in text_of(each) for each in decorators):
             what = "a method" if function else "no such property"
         else:
             continue
@@ -76,7 +76,7 @@ def computed_getters(
         each: repo.function(module, f"{model}.get_{each}") for each in (*GETTERS, "features")
     }
     own = getters.pop("features")
-    other = any(ast.unparse(each.func) not in _JOINS for each in every(own, ast.Call))
+    other = any(text_of(each.func) not in _JOINS for each in every(own, ast.Call))
     wanted = {kind: {"stored" if kind == "xyz" else "activated"} for kind in GETTERS}
     return [
         *(k for k, each in getters.items() if each and returns(each, f"_{k}", unset) != wanted[k]),
@@ -87,7 +87,7 @@ def computed_getters(
 def unset(repo: HostRepo, module: str, model: str) -> set[str]:
     """Attributes that getters of a model ask for, and that are None at first."""
     getters = (repo.function(module, f"{model}.get_{kind}") for kind in GETTERS)
-    texts = " ".join(ast.unparse(each) for each in getters if each)
+    texts = " ".join(text_of(each) for each in getters if each)
     asked = {each: list(defaults(repo, module, each)) for each in _ASKED.findall(texts)}
     nothing = {each: {getattr(v, "value", v) for v in values} for each, values in asked.items()}
     return {each for each, values in nothing.items() if values == {None}}
@@ -96,9 +96,20 @@ def unset(repo: HostRepo, module: str, model: str) -> set[str]:
 Node = TypeVar("Node", bound=ast.AST)
 
 
-def every(tree: ast.AST | None, *kinds: type[Node]) -> list[Node]:
+@lru_cache(maxsize=1 << 16)
+def text_of(node: ast.AST) -> str:
+    """A part of a tree from ``parsed`` as code, cached: many ask."""
+    return ast.unparse(node)
+
+
+def every(tree: ast.AST | None, *kinds: type[Node]) -> tuple[Node, ...]:
     """Those of these kinds among ``nodes``."""
-    return [each for each in nodes(tree) if isinstance(each, kinds)]
+    return _every(tree, kinds)
+
+
+@lru_cache(maxsize=4096)
+def _every(tree: ast.AST | None, kinds: tuple[type[Node], ...]) -> tuple[Node, ...]:
+    return tuple(each for each in nodes(tree) if isinstance(each, kinds))
 
 
 def assigned(tree: ast.AST | None) -> list[tuple[ast.expr, ast.expr]]:
@@ -146,7 +157,7 @@ def failing(repo: HostRepo, scripts: Collection[str]) -> list[str]:
         for top in [name.split(".")[0]]
         if _ELSEWHERE.fullmatch(name) and not (repo.path(top) or (repo.root / top).is_dir())
     ][:1]
-    saving = ast.unparse(repo.function("scene", "Scene.save") or ast.Pass())
+    saving = text_of(repo.function("scene", "Scene.save") or ast.Pass())
     if re.search(r"\b(os\.(replace|rename)|shutil\.move)\(", saving):
         found.append("Scene.save renames the PLY that it saves, and loses its thresholds")
     for script in scripts:
@@ -158,7 +169,7 @@ def failing(repo: HostRepo, scripts: Collection[str]) -> list[str]:
         found += [
             f"{script} compiles {node.name}, which trains"
             for node in every(tree, ast.FunctionDef)
-            if any("torch.compile" in ast.unparse(each) for each in node.decorator_list)
+            if any("torch.compile" in text_of(each) for each in node.decorator_list)
             and any(getattr(each, "attr", "") == "backward" for each in nodes(node))
         ]
         module = module_of(script)
@@ -175,7 +186,7 @@ def home_of(repo: HostRepo, module: str) -> str:
 def owners(tree: ast.AST | None) -> set[str]:
     """Variables, and lists and dicts, that hold models which a script makes."""
     pairs = assigned(tree)
-    return {ast.unparse(a).split("[")[0] for a, b in pairs if "GaussianModel(" in ast.unparse(b)}
+    return {text_of(a).split("[")[0] for a, b in pairs if "GaussianModel(" in text_of(b)}
 
 
 @lru_cache(maxsize=64)  # of the adapters, many ask
@@ -188,19 +199,19 @@ def _misfits(repo: HostRepo, module: str) -> tuple[str, ...]:
     asked = [
         each
         for each in every(tree, ast.If)
-        if isinstance(each.test, ast.Name) or "hasattr(" in ast.unparse(each.test)
+        if isinstance(each.test, ast.Name) or "hasattr(" in text_of(each.test)
     ]
     parts = [*(each.body for each in asked), *(each.body for each in every(tree, ast.Try))]
     tried = {inner for part in parts for each in part for inner in nodes(each)}
     model = _definition(repo, MODEL, "GaussianModel")[1]
-    pairs = [(ast.unparse(to), ast.unparse(value)) for to, value in assigned(tree)]
+    pairs = [(text_of(to), text_of(value)) for to, value in assigned(tree)]
     models = {to for to, value in pairs if value.startswith("GaussianModel(")}
     models -= {to for to, value in pairs if not value.startswith("GaussianModel(")}
     gone = tried | skipped(tree, as_options(repo, ("arguments", module))).keys()
-    texts = ast.unparse(tree or ast.Pass()) + ast.unparse(model or ast.Pass())
+    texts = text_of(tree or ast.Pass()) + text_of(model or ast.Pass())
     calls = [each for each in every(tree, ast.Call) if each not in gone]
     for node in sorted(calls, key=lambda each: (each.lineno, each.col_offset)):
-        owner, _, name = ast.unparse(node.func).rpartition(".")
+        owner, _, name = text_of(node.func).rpartition(".")
         found, at = None, repo.at(module, node.lineno)
         if name in ("capture", "restore"):
             continue
@@ -220,10 +231,10 @@ def _own_folders(repo: HostRepo, module: str) -> Iterator[str]:
     """Folders of data and output that a script sets itself, whatever its command says."""
     body = getattr(repo.tree(module), "body", ())
     asked = [node for node in body if isinstance(node, ast.If)]
-    main = [each for node in asked if "__name__" in ast.unparse(node.test) for each in node.body]
+    main = [each for node in asked if "__name__" in text_of(node.test) for each in node.body]
     for node in (each for each in (*body, *main) if isinstance(each, ast.Assign)):
         name = getattr(node.targets[0], "attr", "")
-        if name in ("source_path", "model_path") and f".{name}" not in ast.unparse(node.value):
+        if name in ("source_path", "model_path") and f".{name}" not in text_of(node.value):
             yield f"sets {name} itself, whatever its command says ({repo.at(module, node.lineno)})"
 
 
@@ -241,14 +252,14 @@ def _absent(repo: HostRepo, module: str) -> tuple[str, ...]:
     }
     for to, value in assigned(tree):
         name = names.get(getattr(getattr(value, "func", None), "id", ""), "")
-        said.setdefault(ast.unparse(to), set()).update(_given(repo, name) or {_ANY})
+        said.setdefault(text_of(to), set()).update(_given(repo, name) or {_ANY})
     for node in every(tree, ast.Call):  # what a script adds by another way than an item
-        said.setdefault(ast.unparse(node.func).removesuffix(".update"), set()).add(_ANY)
+        said.setdefault(text_of(node.func).removesuffix(".update"), set()).add(_ANY)
     gone = skipped(tree, as_options(repo, ("arguments", module)))
     items = [each for each in nodes(tree) if each not in gone and _key(each)]
     own = {_key(each) for each in items if isinstance(getattr(each, "ctx", None), ast.Store)}
     for each in (each for each in items if isinstance(each, ast.Subscript)):
-        known = said.get(ast.unparse(each.value), {_ANY}) | own
+        known = said.get(text_of(each.value), {_ANY}) | own
         if _ANY not in known and _key(each) not in known:
             at = repo.at(module, each.lineno)
             absent += (f"reads {_key(each)} of what it drew, which has no such value ({at})",)
@@ -259,11 +270,11 @@ def _given(repo: HostRepo, name: str) -> set[str]:
     """Texts in a drawing function, the keys of its dict among them; empty if it may add others."""
     body = repo.function("gaussian_renderer", name) if name else None
     pairs = list(assigned(body))
-    named = {ast.unparse(node.value) for node in every(body, ast.Return) if node.value}
-    made = [value for to, value in pairs if ast.unparse(to) in named]
+    named = {text_of(node.value) for node in every(body, ast.Return) if node.value}
+    made = [value for to, value in pairs if text_of(to) in named]
     made += [node.value for node in every(body, ast.Return) if isinstance(node.value, ast.Dict)]
     for node in every(body, ast.Call):
-        owner, _, method = ast.unparse(node.func).rpartition(".")
+        owner, _, method = text_of(node.func).rpartition(".")
         made += node.args if owner in named and method == "update" else []
     texts = {str(each.value) for each in every(body, ast.Constant)}
     dicts = [each for each in made if isinstance(each, ast.Dict) and None not in each.keys]
@@ -384,7 +395,7 @@ def options_of(test: ast.expr, known: Known) -> frozenset[str]:
 
 def _option(node: ast.AST) -> str:
     """The option that an expression is: ``args.x`` or ``getattr(args, "x", ...)``; "" if none."""
-    if isinstance(node, ast.Call) and ast.unparse(node.func) == "getattr":
+    if isinstance(node, ast.Call) and text_of(node.func) == "getattr":
         return str(getattr(node.args[1], "value", "")) if len(node.args) > 1 else ""
     return node.attr if isinstance(node, ast.Attribute) else ""
 
@@ -419,7 +430,7 @@ def returns(getter: Function, stored: str, unset: Collection[str] = ()) -> set[s
     made: dict[str, str] = {}
 
     def known(node: ast.AST) -> list[None]:
-        return [None] if ast.unparse(node).removeprefix("self.") in unset else []
+        return [None] if text_of(node).removeprefix("self.") in unset else []
 
     def state(value: ast.expr | None) -> str:
         if isinstance(value, ast.IfExp) and (taken := decided(value.test, known)) is not None:
@@ -427,11 +438,11 @@ def returns(getter: Function, stored: str, unset: Collection[str] = ()) -> set[s
         while isinstance(value, ast.Call) and getattr(value.func, "attr", "") in shapes:
             value = value.func.value  # type: ignore[attr-defined]
         if isinstance(value, ast.Call) and len(value.args) == 1 and not value.keywords:
-            stands = ast.unparse(value.func) in activations and state(value.args[0]) == "stored"
+            stands = text_of(value.func) in activations and state(value.args[0]) == "stored"
             return "activated" if stands else "computed"
         if isinstance(value, ast.Name):
             return made.get(value.id, "computed")
-        return "stored" if value and ast.unparse(value) == f"self.{stored}" else "computed"
+        return "stored" if value and text_of(value) == f"self.{stored}" else "computed"
 
     gone = skipped(getter, known)
     for statement in getter.body:
@@ -447,14 +458,14 @@ def options(repo: HostRepo, module: str, model: str, scripts: Iterable[str]) -> 
     """What getters ask for that an option of its name, off by default, alone switches on."""
     getters = (repo.function(module, f"{model}.get_{kind}") for kind in GETTERS)
     tests = [n.test for each in getters for n in every(each, ast.If, ast.IfExp)]  # type: ignore[attr-defined]
-    asked = {n.removeprefix("not ").removeprefix("self.") for n in map(ast.unparse, tests)}
+    asked = {n.removeprefix("not ").removeprefix("self.") for n in map(text_of, tests)}
     pairs = (pair for each in (module, *scripts) for pair in assigned(repo.tree(each)))
     made = {
         target.attr
         for target, value in pairs
         if isinstance(target, ast.Attribute)
         and not is_off(value)
-        and ast.unparse(value).split(".")[-1] != target.attr
+        and text_of(value).split(".")[-1] != target.attr
     }
     names = {each: each.split(".")[-1] for each in asked}
     values = {k: [*defaults(repo, "arguments", each)] for k, each in names.items()}
@@ -508,7 +519,7 @@ def _defaults(tree: ast.Module | None) -> dict[str, list[ast.expr]]:
     for node in nodes(tree):
         if isinstance(node, ast.FunctionDef) and node.name == "__init__":
             for made in (each for each in nodes(node) if isinstance(each, ast.Assign)):
-                owner, _, name = ast.unparse(made.targets[0]).partition(".")
+                owner, _, name = text_of(made.targets[0]).partition(".")
                 if owner == "self":
                     found.setdefault(name, []).append(made.value)
         elif isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "add_argument":
@@ -589,7 +600,7 @@ def _of_groups(repo: HostRepo) -> Iterator[str]:
         tree = repo.tree(f"arguments.{path.stem}") if path.stem != "__init__" else None
         yield from _strings(tree)
     for each, _ in assigned(repo.tree("arguments")):
-        if isinstance(each, ast.Attribute) and ast.unparse(each.value) == "self":
+        if isinstance(each, ast.Attribute) and text_of(each.value) == "self":
             yield f"--{each.attr.removeprefix('_')}"
             if each.attr.startswith("_"):
                 yield f"-{each.attr[1]}"

@@ -50,7 +50,7 @@ def parsed(text: str) -> ast.Module | None:
         return None
 
 
-@lru_cache(maxsize=512)
+@lru_cache(maxsize=4096)
 def nodes(tree: ast.AST | None) -> tuple[ast.AST, ...]:
     """Every node of a tree from ``parsed``, or of a part of it, cached; none of None."""
     return tuple(ast.walk(tree)) if tree is not None else ()
