@@ -13,6 +13,7 @@ from miniatures.vanilla_3dgs import HOST
 
 from fragprune_plugins import load
 from fragprune_plugins.adapting import HostRepo, ModelFileError, UsageError
+from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection import launch
 from fragprune_plugins.learning.schedule import USUAL_STOP
 from fragprune_plugins.testing import mutations
@@ -91,7 +92,8 @@ def test_a_page_is_advised_only_of_a_model_that_view_shows(
     name, beside, shown, trained, tmp_path, monkeypatch
 ):
     found, model = trained[1], tmp_path / name
-    shutil.copy(found["model_before"], model)
+    shutil.copy(found["model_after"], model)
+    shutil.copy(sidecar.path_beside(found["model_after"]), sidecar.path_beside(model))
     for each in beside:
         (tmp_path / each).touch()
     summary = launch.RunSummary(
@@ -154,6 +156,18 @@ def test_a_control_lies_beside_the_result_and_is_quoted_with_it(folder):
     assert "pruning itself makes" in run_json("report", out)["result"]
     other = ran(*finetune, "--again", *words, "--lambda_dssim", 0.5)
     assert other["control"] is None  # of another loss
+
+
+def test_thresholds_that_a_host_left_behind_are_missed(scene, tmp_path):
+    host = shutil.copytree(HOST, tmp_path / "host")
+    with (host / "train.py").open("a") as script:  # which tidies up
+        script.write("    from pathlib import Path\n")
+        script.write("    for each in Path(args.model_path).rglob('*.safetensors'):\n")
+        script.write("        each.rename(Path(args.model_path, each.name))\n")
+    words = command(scene, tmp_path / "out")
+    words[1] = host / "train.py"
+    said = ("point_cloud.fragprune.safetensors is not beside it", "there is ")
+    fails("run", *WORDS, *words, says=said, code=1)
 
 
 @pytest.mark.parametrize("held", [True, False])

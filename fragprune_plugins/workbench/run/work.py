@@ -20,7 +20,13 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.errors import FragpruneError, NotComparedError, UnknownHostError
+from fragprune_plugins.errors import (
+    FragpruneError,
+    NotComparedError,
+    SidecarError,
+    UnknownHostError,
+)
+from fragprune_plugins.files import sidecar
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.injection import launch
 from fragprune_plugins.injection.process import current_gpu
@@ -85,6 +91,7 @@ def run(
             summary = _launched(host_command, options)
         if isinstance(summary, Unserved):
             return train_then_finetune(summary, stage, settings, engine, again=again, json=as_json)
+        _expect_thresholds(summary, settings)
         photographs = photographs_of(summary)
         not_compared: FragpruneError | None = summary.not_compared
         if photographs:
@@ -112,6 +119,22 @@ def _launched(command: Sequence[str], options: launch.RunOptions) -> launch.RunS
         if host is None:
             raise
         return host
+
+
+def _expect_thresholds(summary: launch.RunSummary, settings: Settings) -> None:
+    """The model that stage 2 ended with still has what was learned beside it.
+
+    Raises:
+        SidecarError: it has none: the host moved the file, or wrote another one, after it saved.
+    """
+    model = summary.model_after
+    if not (model and summary.steps and settings.goal.learns) or sidecar.find(model):
+        return
+    left = sorted(summary.output.rglob(f"*{sidecar.SUFFIX}")) if summary.output else []
+    found = f"{sidecar.path_beside(model).name} is not beside it"
+    found += f"; in the folder there is {left[-1]}" if left else ""
+    remedy = "Look where the host moved the model that it saved, and move the thresholds there."
+    raise SidecarError(str(model), found, "the thresholds that were learned", remedy)
 
 
 @contextlib.contextmanager
