@@ -149,6 +149,8 @@ class Stages:
             self._learn_within(self.options.from_iter)
             return
         if self.host.line.one_run:
+            if not settings.goal.presses:  # a control trains as long as the run that it is for
+                return self.one_run()
             found = f"{self.host.script.name}, which cannot resume a training"
             expected = "--from-iter, the iteration of one run after which stage 2 begins"
             remedy = "Add it, or give the trained PLY to fragprune finetune."
