@@ -151,6 +151,7 @@ def test_a_control_lies_beside_the_result_and_is_quoted_with_it(folder):
     zero = ran(*finetune, "--control", *words)
     assert zero["model_after"].startswith(str(out / "control"))
     assert {path: path.read_bytes() for path in kept} == kept
+    assert "pruning itself makes" in run("run", *finetune, *words).stdout
     again = ran(*finetune, "--again", *words)
     assert again["control"] == zero["after"]
     assert "pruning itself makes" in run_json("report", out)["result"]

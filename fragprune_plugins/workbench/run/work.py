@@ -237,7 +237,7 @@ def _describe(
     if summary.already_finished:
         return (
             f"{summary.model_after} is finished: stage 2 with these settings wrote it before, and "
-            f"nothing was run. --again learns again.{_comparable(summary)}"
+            f"nothing was run. --again learns again.{_measured(summary)}"
         )
     if not summary.steps:
         return f"{summary.adapter}: the host ended; nothing was learned (--stage {summary.stage})."
@@ -269,13 +269,16 @@ def _describe(
     return "\n".join(lines)
 
 
-def _comparable(summary: launch.RunSummary) -> str:
-    """A line on comparing a finished run's models, if their record says that they were measured."""
+def _measured(summary: launch.RunSummary) -> str:
+    """What a finished run measured, by its record, beside its control; a line to compare again."""
     assert summary.model_after is not None
+    assert summary.output is not None
     record = records.beside(summary.model_after)
     if record is None or not record.data.get("before"):
         return ""
-    return f"\nCompare: fragprune compare {summary.model_before} {summary.model_after}"
+    control = records.control_of(record.data, records.files(summary.output, below=True))
+    said = wording.outcome("run", record.data, control)
+    return f"\n{said}\nCompare: fragprune compare {summary.model_before} {summary.model_after}"
 
 
 def _viewable(model: Path) -> bool:
