@@ -26,6 +26,7 @@ from fragprune_plugins.injection.cpu_only import cpu_only
 READ = "Read the host's own message above."
 
 _OURS = Path(__file__).parents[1]
+_REDIRECTING = str(Path(__file__).with_name("cpu_only.py"))
 
 
 @contextlib.contextmanager
@@ -37,7 +38,9 @@ def telling(script: Path, root: Path) -> Iterator[None]:
         raise
     except Exception as error:
         traceback.print_exc()
-        frames = traceback.extract_tb(error.__traceback__)
+        every = traceback.extract_tb(error.__traceback__)
+        # On a CPU each call of torch passes through ours, whoever made it.
+        frames = [frame for frame in every if frame.filename != _REDIRECTING]
         inside = [frame for frame in frames if Path(frame.filename).is_relative_to(root)]
         where = script.name
         if inside:

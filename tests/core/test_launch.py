@@ -235,6 +235,11 @@ def test_what_our_own_code_raises_is_not_said_to_be_the_hosts(host, monkeypatch,
         run([host("import torch\ntorch.median(0)")], CPU)
 
 
+def test_what_torch_refuses_a_host_on_a_cpu_is_not_said_to_be_ours(host):
+    with pytest.raises(HostFailed, match=r"train\.py:2 .*Read the traceback above\.$"):
+        run([host("import torch\ntorch.zeros(2)[torch.ones(3, dtype=torch.bool)]")], CPU)
+
+
 def test_what_a_host_imports_and_reads_is_looked_at_before_it_runs(host, tmp_path):
     """All at once, not one traceback after the other."""
     host("import icecream_of_tests", name="neighbour.py")
