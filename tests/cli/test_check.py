@@ -179,6 +179,15 @@ def test_a_folder_that_is_no_host(tmp_path):
     assert "docs/" not in text
 
 
+def test_a_folder_whose_scripts_use_the_one_above_names_it(host):
+    inner = host / "variant"
+    inner.mkdir()
+    (inner / "train.py").write_text("import scene\n")
+    result = run("check", inner)
+    assert result.exit_code == 1
+    assert f"fits vanilla-3dgs, as run finds: fragprune check {host}" in result.stdout
+
+
 def test_a_fork_that_does_not_fit_is_told_once_why(tmp_path):
     """The nearest adapter speaks for all that look for the same."""
     skeleton(tmp_path, groups=("xyz", "color", "albedo"))

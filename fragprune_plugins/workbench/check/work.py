@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -75,7 +76,7 @@ def _single(
         lines += ["", f"Not installed, but imported: {', '.join(map(str, missing))}"]
         lines += [f"  {way}" for way in install(missing).splitlines()]
     if judged.kind != "inside":
-        lines += ["", _conclusion(repo, fitting)]
+        lines += ["", _conclusion(repo, fitting, adapters)]
     data = {
         "host": str(host),
         "commit": repo.commit,
@@ -235,13 +236,16 @@ def _repository(host: Path, adapters: list[HostAdapter], name: str | None) -> Ho
         return repo
 
 
-def _conclusion(repo: HostRepo, fitting: list[Attempt]) -> str:
+def _conclusion(repo: HostRepo, fitting: list[Attempt], adapters: list[HostAdapter]) -> str:
 
     if len(fitting) == 1:
         return f"Use: {usage(fitting[0].adapter, repo)}"
     if fitting:
         names = ", ".join(each.adapter.name for each in fitting)
         return f"Several adapters fit: {names}. Name one with fragprune run --adapter."
+    with contextlib.suppress(UnknownHostError):  # scripts of this folder may use the one above
+        above, adapter = locate(repo, adapters)
+        return f"The folder above fits {adapter.name}, as run finds: fragprune check {above.root}"
     return (
         "To write an adapter: the documentation's page Write an adapter in 30 minutes, or "
         "python -m pydoc fragprune_plugins.adapting"
