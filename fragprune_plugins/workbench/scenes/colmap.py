@@ -162,11 +162,14 @@ def _cameras_text(reading: Reading) -> Iterator[tuple[int, Lens]]:
 
 def _images_text(reading: Reading) -> Iterator[Pose]:
     # Two lines an image; the second, its 2D points, may be empty.
-    for index, line in enumerate(_text_lines(reading)):
-        if index % 2 == 0 and line.strip():
+    lines = _text_lines(reading)
+    for line in lines:
+        if line.strip():
             fields = line.split(maxsplit=9)
             numbers = tuple(float(value) for value in fields[1:8])
             yield fields[9].strip(), int(fields[8]), numbers[:4], numbers[4:]
+            if (points := len(next(lines, "").split())) % 3:
+                raise ValueError(f"{points} words where an image's 2D points belong: x, y, id each")
 
 
 def _unpack(reading: Reading, layout: str) -> tuple[Any, ...]:
