@@ -108,6 +108,11 @@ LENS = '{"camera_model": "EQUIRECTANGULAR", '
             lambda f: (f / IMAGES).write_text("1 1 0 0 0 0 0 0 7 view00.png\n\n"),
             "no training view",
         ),
+        (
+            tiny.write_colmap,
+            lambda f: (f / IMAGES).write_text((f / IMAGES).read_text().replace("\n\n", "\n")),
+            "images.txt.* at line 3 .*10 words where an image's 2D points belong",
+        ),
     ],
 )
 def test_bad_scenes_are_refused_by_name(tmp_path, images, write, break_it, words):
@@ -115,6 +120,14 @@ def test_bad_scenes_are_refused_by_name(tmp_path, images, write, break_it, words
     break_it(tmp_path)
     with pytest.raises(DatasetError, match=words):
         load_dataset(tmp_path)
+
+
+def test_photographs_that_are_held_out_and_learned_from_are_warned_of(tmp_path, images, caplog):
+    assert load_dataset(tiny.write_blender(tmp_path, images)).leaked == 0
+    assert not caplog.text
+    (tmp_path / TEST).write_text((tmp_path / "transforms_train.json").read_text())
+    assert load_dataset(tmp_path).leaked == 7
+    assert "7 of the 7 held-out views are training views too" in caplog.text
 
 
 def test_what_is_no_scene_or_two_is_refused_by_name(tmp_path, images):

@@ -23,7 +23,6 @@ from fragprune_plugins.workbench.models import formats
 from fragprune_plugins.workbench.models.model import describe_written
 from fragprune_plugins.workbench.pruning import Keep
 from fragprune_plugins.workbench.scenes.dataset import Dataset
-from fragprune_plugins.workbench.scenes.output import saw_all
 
 LOST = 0.05
 """A loss of PSNR against the model as it came, in dB, from which on more is advised."""
@@ -59,6 +58,7 @@ class Finetuned:
         forgotten: dB that a trial made other photographs worse; None without a trial.
         found: what a search for the strongest truncation found; None without one.
         truncated: the result has thresholds, here or in another process.
+        seen: training has seen held-out views, in this fine-tuning or before it.
         shards: processes that hold a part of the Gaussians each; 1 where each holds them all.
     """
 
@@ -68,6 +68,7 @@ class Finetuned:
     forgotten: float | None
     found: Bounded | None
     truncated: bool
+    seen: bool
     shards: int = 1
 
     def measured(self, dataset: Dataset, engine: Engine) -> dict[str, dict[str, Any]]:
@@ -123,7 +124,7 @@ class Finetuned:
             "after": after,
             "untruncated": figures.get("untruncated"),
             "self": asked.itself,
-            "seen": not asked.itself and saw_all(asked.model),
+            "seen": self.seen,
             "keep": asked.keep,
             "forgotten": self.forgotten,
             "speedup": done.speedup,

@@ -36,6 +36,7 @@ from fragprune_plugins.workbench.pruning import kept
 from fragprune_plugins.workbench.ranks import Ranks, joined, launched
 from fragprune_plugins.workbench.scenes.dataset import Dataset, load_photographs
 from fragprune_plugins.workbench.scenes.generated import views_near
+from fragprune_plugins.workbench.scenes.output import saw_all
 
 _say = partial(click.echo, err=True)
 
@@ -169,6 +170,7 @@ def _learned(opened: _Opened, ranks: Ranks, lost: float | None) -> tuple[Finetun
         forgotten=lost,
         found=found,
         truncated=ranks.gather(saved.falloff is not None)[0],
+        seen=opened.dataset.leaked > 0 or (not asked.itself and saw_all(asked.model)),
         shards=ranks.size if asked.shard else 1,
     )
     return over, engine

@@ -295,7 +295,7 @@ class Looking:
     """What ``RunOptions.look`` calls; ``trial`` is None where nothing could be tried.
 
     Attributes:
-        seen: the training of stage 1, of an earlier command, held no view out.
+        seen: the training of stage 1 has seen held-out views.
     """
 
     engine: EngineOptions
@@ -322,6 +322,7 @@ class Looking:
         engine = _AsTheHost(rasterizer.name, rasterizer, drawing)
         model = load(ply, filtered=True, device=device)
         dataset = load_photographs(photographs).to(device)
+        self.seen |= dataset.leaked > 0
         trial, left = tried(model, dataset, settings, engine=engine, say=log.info), None
         if trial.keep is not None:
             shots = dataset.train

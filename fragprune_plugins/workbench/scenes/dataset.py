@@ -212,6 +212,15 @@ class Dataset:
         centres = torch.stack([shot.view.campos for shot in self.train])
         return 1.1 * float((centres - centres.mean(0)).norm(dim=1).max()) or 1.0
 
+    @property
+    def leaked(self) -> int:
+        """How many held-out photographs are training photographs too; 0 of own pictures."""
+        train, test = (
+            [os.path.realpath(shot.path) for shot in part if isinstance(shot, Photograph)]
+            for part in (self.train, self.test)
+        )
+        return len([path for path in test if path in train])
+
     def to(self, device: torch.device | str) -> Dataset:
         """The same photographs with their views on a device."""
         return Dataset([s.to(device) for s in self.train], [s.to(device) for s in self.test])
@@ -251,7 +260,14 @@ def load_dataset(
         [make_shot(row, background, size) for row in part]
         for part in read_scene(Path(folder), images)
     )
-    return Dataset(train, test)
+    dataset = Dataset(train, test)
+    if dataset.leaked:
+        log.warning(
+            "%s: %d of the %d held-out views are training views too, so figures on them flatter: "
+            "remove these from one of the two",
+            *(printable(str(folder)), dataset.leaked, len(test)),
+        )
+    return dataset
 
 
 def read_scene(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]]:
@@ -278,7 +294,7 @@ def read_scene(folder: Path, images: str = "images") -> tuple[list[Posed], list[
                 str(folder),
                 f"no {name} view ({len(train) + len(test)} in all)",
                 "at least one training and one held-out view",
-                "Add photographs; every 8th is held out.",
+                "Add photographs; every 8th is held out, unless the scene lists others by name.",
             )
     return train, test
 
