@@ -66,7 +66,7 @@ def splat_of(
     if thresholds is not None and not ((thresholds > 0) & (thresholds < 1)).all():
         raise ValueError("thresholds outside (0, 1)")
     inside = np.clip(np.asarray(opacities, np.float64), _ALPHA_EDGE, 1 - _ALPHA_EDGE)
-    rotations = np.array(rotations, np.float32)
+    rotations = np.array(rotations, np.float32, order="C")  # else each frame copies them
     rotations[(rotations == 0).all(axis=1), 0] = 1
 
     def tensor(values: npt.NDArray[Any]) -> Tensor:
