@@ -1,6 +1,7 @@
 """Films: where the camera is in each frame, and what the file holds."""
 
 import re
+import resource
 import subprocess
 import sys
 
@@ -11,6 +12,7 @@ import torch
 from cli.commands import fails, run_json
 from finetune import tiny
 
+from fragprune_plugins.errors import OutputError
 from fragprune_plugins.workbench.models.formats.ply import write_ply
 from fragprune_plugins.workbench.render import work
 from fragprune_plugins.workbench.render.filming import along, orbit, write_mp4
@@ -86,6 +88,19 @@ def test_a_failed_film_leaves_the_earlier_one(tmp_path):
         write_mp4(path, frames(), 10)
     assert path.read_bytes() == b"earlier"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_film_that_a_full_disk_cuts_off_leaves_the_earlier_one(tmp_path):
+    path = tmp_path / "a.mp4"
+    path.write_bytes(b"earlier")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+    try:
+        with pytest.raises(OutputError, match="not written to its end"):
+            write_mp4(path, [torch.rand(3, 64, 64)] * 3, 10)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert path.read_bytes() == b"earlier"
 
 
 def test_render_films_an_orbit_and_a_path(tmp_path, monkeypatch):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
+import subprocess
 from collections.abc import Iterable
 from pathlib import Path
 from types import ModuleType
@@ -98,9 +99,18 @@ def write_mp4(path: Path, frames: Iterable[Tensor], fps: int) -> None:
                     )
                     writer.send(None)
                 writer.send(shown.tobytes())
+            if writer is not None:
+                writer.close()
+                opening = ["-v", "error", "-i", str(temporary), "-t", "0", "-f", "null", "-"]
+                opened = subprocess.run(
+                    [encoder.get_ffmpeg_exe(), *opening], stdin=subprocess.DEVNULL
+                )
+                if opened.returncode:  # the writer does not say how it ended
+                    raise OSError("it cannot be opened")
         except OSError as error:
-            why = str(error).strip().split("\n")[-1][:200]
-            raise OutputError(str(path), why, "a film", "Check the place and its space.") from error
+            found = f"not written to its end ({str(error).strip().splitlines()[0][:200]})"
+            remedy = "Check the place and its space; ffmpeg said more on stderr."
+            raise OutputError(str(path), found, "a film", remedy) from error
         finally:
             if writer is not None:
                 writer.close()
