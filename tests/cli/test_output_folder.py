@@ -99,6 +99,17 @@ def test_views_that_a_training_saw_are_not_said_to_be_held_out(data, model, tmp_
     assert run_json("finetune", output, *words)["seen"] is not held
 
 
+def test_photographs_that_are_learned_from_too_are_not_said_to_be_held_out(model, tmp_path):
+    data = tiny.write_blender(tmp_path / "scene", tiny.photographs(model))
+    (data / "transforms_test.json").write_text((data / "transforms_train.json").read_text())
+    path = tmp_path / "a model.ply"
+    write_ply(path, model)
+    words = ("--data", data, "--out", tmp_path / "a b.ply", "--iters", 3, "--train", "opacity")
+    said = run("finetune", path, *words).stdout
+    assert "on 7 views that its training had seen." in said
+    assert f'fragprune view "{tmp_path / "a b.ply"}". A page' in said  # as words of a command
+
+
 SIZES = {
     -1: Resolution(width=1600, shrink_only=True),
     1: Resolution(divide=1),

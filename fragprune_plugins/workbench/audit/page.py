@@ -12,7 +12,7 @@ from typing import Any
 from fragprune_plugins.workbench.audit.audit import DARK, SHOWN, Shown
 from fragprune_plugins.workbench.figures import page
 from fragprune_plugins.workbench.figures.pictures import save_image, save_map, stems
-from fragprune_plugins.workbench.figures.wording import fewer, frames
+from fragprune_plugins.workbench.figures.wording import fewer, frames, quoted
 from fragprune_plugins.workbench.report.page import shared_limit
 
 ALONE = (
@@ -79,9 +79,9 @@ def sentence(figures: Mapping[str, Any]) -> str:
 
 def advice(figures: Mapping[str, Any]) -> tuple[str, str]:
     """The command that learns cutoffs for this model, and what it gained elsewhere."""
-    data = figures["data"]
-    pictures, gained = ("--self", ALONE) if data is None else (f"--data {data}", FROM_PHOTOGRAPHS)
-    return f"fragprune finetune {figures['model']} {pictures} --out pruned.ply", gained
+    model, data = quoted(figures["model"]), f"--data {quoted(figures['data'])}"
+    pictures, gained = ("--self", ALONE) if figures["data"] is None else (data, FROM_PHOTOGRAPHS)
+    return f"fragprune finetune {model} {pictures} --out pruned.ply", gained
 
 
 def pruning(figures: Mapping[str, Any]) -> str:

@@ -253,9 +253,14 @@ def next_steps(model: Path | None, folder: Path, scene: Path | None = None) -> s
     ``model`` is None if ``view`` does not show it. ``scene`` is the folder of its photographs:
     elsewhere, ``report`` reads it only by name.
     """
-    look = f"Look at it: fragprune view {model}. " if model else ""
-    data = "" if scene is None or lies_in(scene, folder) else f" --data {scene}"
-    return f"{look}A page to share: fragprune report {folder}{data}"
+    look = f"Look at it: fragprune view {quoted(model)}. " if model else ""
+    data = "" if scene is None or lies_in(scene, folder) else f" --data {quoted(scene)}"
+    return f"{look}A page to share: fragprune report {quoted(folder)}{data}"
+
+
+def quoted(path: object) -> str:
+    """A path as a word of a command to copy."""
+    return f'"{path}"' if " " in str(path) else str(path)
 
 
 def begun(data: Mapping[str, Any]) -> list[str]:
