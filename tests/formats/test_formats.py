@@ -130,7 +130,9 @@ def test_the_same_model_gives_the_same_bytes(suffix, tmp_path):
 @pytest.mark.parametrize("suffix", [".splat", ".compressed.ply"])
 def test_a_format_without_thresholds_refuses_them(suffix, tmp_path):
     path = tmp_path / f"a{suffix}"
-    with pytest.raises(OutputError, match=r"cannot hold cutoffs.*--no-truncation"):
+    with pytest.raises(
+        OutputError, match=rf"\[output\] {path}: a .*cannot hold cutoffs.*--no-truncation"
+    ):
         save(path, tiny.cut(random_splat(5, 0, 0), 0.4))
     assert list(tmp_path.iterdir()) == []
 

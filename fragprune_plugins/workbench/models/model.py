@@ -122,7 +122,10 @@ def save(path: str | Path, model: Model | Trained) -> None:
         expect_finite(model.thresholds.numbers, str(path))
     with staging(path) as folder:
         new = folder / path.name
-        formats.write(form, new, model)
+        try:
+            formats.write(form, new, model)
+        except OutputError as error:  # it knows the name for the meantime only
+            raise OutputError(str(path), error.found, error.expected, error.remedy) from error
         if form.paired:
             sidecar.replace_pair(path, new, None)
         else:
