@@ -54,11 +54,13 @@ def kept(
         progress: draw a bar on stderr.
 
     Raises:
-        InputError: the share is not in (0, 1], or no Gaussian is visible.
+        InputError: the share is not in (0, 1], there is no view, or no Gaussian is visible.
     """
     drawer = engine_for(engine, model.device)
     if keep == "visible":
         return visible(model, views, engine=drawer)
+    if not views or (keep == "auto" and not shots):
+        raise InputError("keep", "no view to judge by", "at least one", "Pass views of the model.")
     scores = removal_error(model, model.falloff, _bar(views, progress), drawer)
     if keep != "auto":
         return best(scores, keep)

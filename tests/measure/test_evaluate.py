@@ -5,8 +5,11 @@ import torch
 from finetune import tiny
 from PIL import Image
 
+from fragprune_plugins import finetune, keep_best, keep_needed
+from fragprune_plugins.errors import InputError
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure, measure_all
 from fragprune_plugins.workbench.figures.pictures import save_image, save_panel
+from fragprune_plugins.workbench.scenes.dataset import Dataset
 
 NAMES = {
     *("target", "psnr", "ssim", "lpips", "fragments_per_pixel", "evaluated_per_pixel"),
@@ -50,6 +53,17 @@ def test_a_model_is_measured_as_its_host_draws_it(truth, shots):
     plain, wide = measure_all(candidates, shots)
     assert wide["fragments_per_pixel"] > plain["fragments_per_pixel"]
     assert wide["psnr"] < plain["psnr"]
+
+
+def test_nothing_to_measure_learn_or_judge_by_is_stated(truth, shots):
+    for views, repeats in (([], 1), (shots, 0)):
+        with pytest.raises(InputError, match="at least one of each"):
+            measure(truth, views, repeats=repeats)
+    with pytest.raises(InputError, match="no training view"):
+        finetune(truth, Dataset([], shots))
+    for keep in (lambda: keep_best(truth, 0.5, []), lambda: keep_needed(truth, [])):
+        with pytest.raises(InputError, match="no view to judge by"):
+            keep()
 
 
 def test_images_are_written_as_seen(tmp_path):

@@ -15,6 +15,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from fragprune_plugins.engines import Engine
+from fragprune_plugins.errors import InputError
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.area import SQUARED_RADIUS
 from fragprune_plugins.plugins.hooks import engine_for, thresholds_for
@@ -104,7 +105,7 @@ def measure(
 
     Raises:
         EngineError: no such engine here.
-        InputError: pictures smaller than 11x11 pixels.
+        InputError: pictures smaller than 11x11 pixels, or no view.
     """
     shots = dataset.test if isinstance(dataset, Dataset) else dataset
     return measure_all([Candidate(models.of(model))], shots, engine=engine, repeats=repeats)[0]
@@ -128,6 +129,9 @@ def measure_all(
     """
     device = candidates[0].model.device
     engine = engine_for(engine, device)
+    if not shots or repeats < 1:
+        found = f"{len(shots)} views and {repeats} repeats"
+        raise InputError("measure", found, "at least one of each", "Pass views; raise repeats.")
     shots = [shot.to(device) for shot in shots]
     reports: list[dict[str, Any]] = []
     for candidate in candidates:

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.errors import UsageError
+from fragprune_plugins.errors import InputError, UsageError
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.interruption import Terminate
 from fragprune_plugins.learning.schedule import Schedule, Settings
@@ -60,6 +60,7 @@ def finetune(
 
     Raises:
         EngineError: no such engine here.
+        InputError: the dataset has no training view.
         CheckpointError: the checkpoint is broken, or another fine-tuning's.
         PluginError: a plugin raised, or gave an answer that cannot be used.
         UsageError: a target time that no thresholds reach; a portable goal for a model with
@@ -71,6 +72,8 @@ def finetune(
     settings, device = settings or Settings(), model.device
     engine = engine_for(engine, device)
     dataset = dataset.to(device)
+    if not dataset.train:
+        raise InputError("dataset", "no training view", "at least one", "Pass photographs.")
     goal = settings.goal
     if isinstance(goal, AtMost):
         train = partial(finetune, model, dataset, engine=engine, progress=progress, ranks=ranks)
