@@ -15,7 +15,7 @@ from finetune import tiny
 from formats.scenes import apart, random_splat, splats
 from hypothesis import HealthCheck, given, settings
 
-from fragprune_plugins import ThresholdStore, load, save
+from fragprune_plugins import ThresholdStore, load, load_dataset, measure, save
 from fragprune_plugins.errors import FragpruneError, ModelFileError, OutputError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply
@@ -325,6 +325,7 @@ def test_finetune_reads_and_writes_spz(tmp_path):
     assert load(out).thresholds is not None
     assert not sidecar.path_beside(out).exists()
     assert run_json(*words)["already_finished"]
+    assert report["after"]["psnr"] == measure(out, load_dataset(data), repeats=1)["psnr"]
     ply = (*words[:-3], tmp_path / "pruned.ply", *words[-2:])
     assert not run_json(*ply)["already_finished"]  # its record has the same name
     refused = run(*words[:-3], tmp_path / "pruned.splat", *words[-2:])

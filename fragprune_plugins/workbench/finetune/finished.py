@@ -20,7 +20,7 @@ from fragprune_plugins.workbench.finetune.loop import FinetuneResult
 from fragprune_plugins.workbench.finetune.searching import Bounded
 from fragprune_plugins.workbench.finetune.trial import DROPOUT, KEEP
 from fragprune_plugins.workbench.models import formats
-from fragprune_plugins.workbench.models.model import describe_written
+from fragprune_plugins.workbench.models.model import describe_written, load
 from fragprune_plugins.workbench.pruning import Keep
 from fragprune_plugins.workbench.scenes.dataset import Dataset
 
@@ -73,15 +73,27 @@ class Finetuned:
 
     def measured(self, dataset: Dataset, engine: Engine) -> dict[str, dict[str, Any]]:
         """Figures on held-out views: before, after; untruncated and control where there are any."""
-        result = self.result
-        whole = result.progress.gaussians if self.shards > 1 else None
-        models = {"before": self.start, "after": Candidate(result.model, gaussians=whole)}
+        after = self.result.model
+        if self._rounds and not self._as_learned:
+            after = load(self.asked.out, device=after.device)
+        whole = self.result.progress.gaussians if self.shards > 1 else None
+        models = {"before": self.start, "after": Candidate(after, gaussians=whole)}
         if self.truncated:
-            models["untruncated"] = Candidate(result.model.untruncated(), gaussians=whole)
+            models["untruncated"] = Candidate(after.untruncated(), gaussians=whole)
         if self.found is not None:
             models["control"] = Candidate(self.found.control.model)
         figures = measure_all(list(models.values()), dataset.test, engine=engine)
         return dict(zip(models, figures, strict=True))
+
+    @property
+    def _rounds(self) -> bool:
+        """Whether the file holds other numbers than were learned."""
+        return bool(formats.named(self.asked.out).keeps)
+
+    @property
+    def _as_learned(self) -> bool:
+        """Whether figures are of the model before it was rounded: a part of it, or one chosen."""
+        return self.shards > 1 or self.found is not None
 
     def report(
         self,
@@ -158,7 +170,7 @@ class Finetuned:
             f"{result.engine} engine, {data['iterations']} iterations{pressure} in "
             f"{result.train_seconds:.0f} s.",
         ]
-        if (better := advise(data)) is not None:
+        if not self._rounds and (better := advise(data)) is not None:  # rounding lost it, maybe
             lines.append(better)
         if self.shards > 1:
             lines.append(
@@ -174,12 +186,11 @@ class Finetuned:
         plain = data["untruncated"]
         if plain is not None:
             lines.append(describe_untruncated(before, plain))
-        form = formats.named(self.asked.out)
         held = ", which holds the cutoffs" if plain else ""
         if settings.goal.on_area:
             held = ", which every viewer draws as it is"
         lines.append(describe_written(self.asked.out, held))
-        if form.keeps:
+        if self._rounds and self._as_learned:
             lines.append("The figures above are of the model as it was learned, before rounding.")
         return "\n".join(lines)
 
