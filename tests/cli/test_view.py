@@ -89,6 +89,8 @@ def test_the_cameras_of_a_training_are_found(data, model, page):
 
 
 def test_one_page(cut, tmp_path):
+    short = tmp_path / "mine.htm"
+    assert run_json("view", cut, "--out", short)["files"] == [str(short)]
     report = run_json("view", cut, "--out", tmp_path / "pages" / "mine.html")
     assert report["files"] == [str(tmp_path / "pages" / "mine.html")]
     assert [each.name for each in (tmp_path / "pages").iterdir()] == ["mine.html"]

@@ -124,7 +124,7 @@ def _table(data: dict[str, Any]) -> str:
             lines.append(f"{'':<29}{parts}")
     for name, saved in data["saved"].items():
         lines.append(
-            f"{name}: {saved['fragments']:.2f}x fewer fragments, {saved['time']:.2f}x less time "
+            f"{name}: {saved['fragments']:.2f}x fewer fragments, frames {saved['time']:.2f}x as fast "
             f"({100 * saved['share']:.0f}% of it)"
         )
     first, loads = results[0], "load unknown on this system"

@@ -45,7 +45,7 @@ def view(
     no_browser: bool,
 ) -> Report:
     """Do what ``fragprune view`` promises; its options are the arguments."""
-    single = out is not None and out.suffix.lower() == ".html"
+    single = out is not None and out.suffix.lower() in (".html", ".htm")
     if out is not None:
         _expect_our_page(out if single else out / "index.html")
         writable_folder(out.parent if single else out)
