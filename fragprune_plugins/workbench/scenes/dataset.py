@@ -216,10 +216,10 @@ class Dataset:
     def leaked(self) -> int:
         """How many held-out photographs are training photographs too; 0 of own pictures."""
         train, test = (
-            [os.path.realpath(shot.path) for shot in part if isinstance(shot, Photograph)]
+            {os.path.realpath(shot.path) for shot in part if isinstance(shot, Photograph)}
             for part in (self.train, self.test)
         )
-        return len([path for path in test if path in train])
+        return len(train & test)
 
     def to(self, device: torch.device | str) -> Dataset:
         """The same photographs with their views on a device."""
