@@ -124,8 +124,8 @@ def _table(data: dict[str, Any]) -> str:
             lines.append(f"{'':<29}{parts}")
     for name, saved in data["saved"].items():
         lines.append(
-            f"{name}: {saved['fragments']:.2f}x fewer fragments, frames {saved['time']:.2f}x as fast "
-            f"({100 * saved['share']:.0f}% of it)"
+            f"{name}: {saved['fragments']:.2f}x fewer fragments, "
+            f"frames {saved['time']:.2f}x as fast ({100 * saved['share']:.0f}% of it)"
         )
     first, loads = results[0], "load unknown on this system"
     if machine["load_before"] is not None:
