@@ -148,11 +148,13 @@ def test_photographs_of_another_scene_are_told_before_the_learning(path, model, 
 ALIKE = {"train": "all", "opacity_lr": None, "seed": 0, "views_per_step": 1}
 
 
-def measured(goal, psnr=30.0, iterations=3, keep=None, adapter=None, words=(), **settings):
+def measured(
+    goal, psnr=30.0, iterations=3, keep=None, adapter=None, words=(), pictures=None, **settings
+):
     """A record's data of a training that began with so many dB."""
     begun = {"views": 2, "gaussians": 60, "psnr": psnr}
     figures = {"before": begun, "after": begun | {"goal": goal}, "iterations": iterations}
-    figures |= {"keep": keep, "adapter": adapter, "host_options": [*words]}
+    figures |= {"keep": keep, "adapter": adapter, "host_options": [*words], "pictures": pictures}
     return figures | {"settings": ALIKE | {"goal": goal} | settings}
 
 
@@ -172,6 +174,8 @@ def measured(goal, psnr=30.0, iterations=3, keep=None, adapter=None, words=(), *
         ({"adapter": "vanilla-3dgs"}, {}, False),
         ({"adapter": "vanilla-3dgs"}, {"adapter": "vanilla-3dgs"}, True),
         ({}, {"psnr": 30.1}, False),
+        *(({"pictures": known}, {"pictures": "one"}, True) for known in (None, "one")),
+        ({"pictures": "another"}, {"pictures": "one"}, False),
         ({"words": ["--lambda_dssim", "0.5"]}, {}, False),
         ({"words": ["--eval"]}, {"words": ["--eval"]}, True),
         ({"stop": 0.01}, {"stop": 0.01}, False),

@@ -210,9 +210,10 @@ def recorded(record: Record) -> Recorded | None:
 def control_of(data: dict[str, Any], among: Sequence[Path]) -> dict[str, Any] | None:
     """Find the measurement of a fine-tuning's control; None if no file records it.
 
-    The control started from the same model, by the same host's loop and options or ours, with the
-    same iterations, views in each step, seed and settings, and kept as many Gaussians or all, but
-    without truncation and without a stop or a dropout of its own.
+    The control started from the same model, by the same host's loop and options or ours, on the
+    same photographs as far as is known, with the same iterations, views in each step, seed and
+    settings, and kept as many Gaussians or all, but without truncation and without a stop or a
+    dropout of its own.
     Files that are not records are ignored.
 
     Args:
@@ -240,6 +241,7 @@ def _is_control(other: dict[str, Any], data: dict[str, Any]) -> bool:
         and other.get("adapter") == data.get("adapter")
         and other.get("host_options", []) == data.get("host_options", [])
         and other["iterations"] == data["iterations"]
+        and other.get("pictures") in (None, data.get("pictures"))
         and other.get("keep") in (None, data.get("keep"))
         and begun
         and before

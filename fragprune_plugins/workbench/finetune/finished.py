@@ -107,7 +107,8 @@ class Finetuned:
             photographs: where they lie, for the record; None where there are none.
             configuration: by which the same command is known again.
         """
-        data, asked, result = self._data(figures), self.asked, self.result
+        data = self._data(figures, configuration["photographs"])
+        asked, result = self.asked, self.result
         text = self._text(data)
         more: dict[str, Any] = {"curves": [asdict(point) for point in result.curves]}
         if asked.itself:
@@ -122,8 +123,8 @@ class Finetuned:
         then = wording.next_steps(asked.out, asked.out.parent, scene)  # records name no folders
         return Report(data, f"{text}\n{then}", exit_code=130 if result.interrupted else 0)
 
-    def _data(self, figures: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
-        """What the record and ``--json`` say, from figures as ``measured``."""
+    def _data(self, figures: Mapping[str, dict[str, Any]], pictures: str) -> dict[str, Any]:
+        """What the record and ``--json`` say, from figures as ``measured``, and a digest."""
         asked, result, settings = self.asked, self.result, self.result.settings
         after, control, done = figures["after"], figures.get("control"), result.progress
         if self.found is not None and self.found.control.progress.steps > done.steps:
@@ -137,6 +138,7 @@ class Finetuned:
             "untruncated": figures.get("untruncated"),
             "self": asked.itself,
             "seen": self.seen,
+            "pictures": pictures,
             "keep": asked.keep,
             "forgotten": self.forgotten,
             "speedup": done.speedup,
