@@ -239,7 +239,7 @@ def _is_control(other: dict[str, Any], data: dict[str, Any]) -> bool:
         and theirs.get("stop") in (None, "auto")
         and theirs.get("dropout") in (None, 0, mine.get("dropout"))
         and other.get("adapter") == data.get("adapter")
-        and other.get("host_options", []) == data.get("host_options", [])
+        and other.get("host_options") in (None, data.get("host_options"))
         and other["iterations"] == data["iterations"]
         and other.get("pictures") in (None, data.get("pictures"))
         and other.get("keep") in (None, data.get("keep"))

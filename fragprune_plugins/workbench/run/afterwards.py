@@ -6,11 +6,13 @@ import logging
 import subprocess
 import sys
 import time
+from argparse import Namespace
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from fragprune_plugins.errors import HostFailed, UsageError
+from fragprune_plugins.hosts.adapter import Flags
 from fragprune_plugins.hosts.choosing import attempt
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.command import split
@@ -37,21 +39,14 @@ class Unserved:
     Attributes:
         program: the words of the command that name what the interpreter runs.
         arguments: those after them.
+        flags: those that 3DGS has: output and source, None where not given, and images.
         why: what speaks against the nearest adapter.
     """
 
     program: tuple[str, ...]
     arguments: tuple[str, ...]
+    flags: Namespace
     why: str
-
-    def value(self, *flags: str) -> Path | None:
-        """The path behind one of these flags, the last; None if the command has none of them."""
-        found = None
-        for word, after in zip(self.arguments, (*self.arguments[1:], ""), strict=True):
-            name, equals, value = word.partition("=")
-            if name in flags and (equals or after):
-                found = Path(value if equals else after)
-        return found
 
     def train(self, *, quietly: bool) -> None:
         """Run the command in a process of its own; with ``quietly`` it prints to stderr.
@@ -78,7 +73,7 @@ class Unserved:
         Raises:
             HostFailed: there is none.
         """
-        folder = self.value("-m", "--model_path") or Path.cwd()
+        folder: Path = self.flags.output or Path.cwd()
         found = [each for each in folder.rglob("point_cloud.ply") if each.stat().st_mtime >= since]
         if not found:
             what = f"no point_cloud.ply in {folder}" + (" since it began" if since else "")
@@ -97,8 +92,13 @@ def unserved(command: Sequence[str]) -> Unserved | None:
     if any(each.match.fits for each in tried):
         return None
     program = ("-m", module) if module else (str(script),)
+    parser = Flags(add_help=False, allow_abbrev=False)
+    parser.add_argument("-m", "--model_path", dest="output", type=Path)
+    parser.add_argument("-s", "--source_path", dest="source", type=Path)
+    parser.add_argument("-i", "--images", default="images")
+    flags, _ = parser.parse_known_args(arguments)
     why = tried[0].brief() if tried else "none is installed"
-    return Unserved(program, tuple(arguments), why)
+    return Unserved(program, tuple(arguments), flags, why)
 
 
 def train_then_finetune(
@@ -121,14 +121,14 @@ def train_then_finetune(
         HostFailed: it ended with an error code, or left no model.
     """
     log.info("no adapter fits (%s), but its PLY is plain 3DGS", host.why)
-    source, since = host.value("-s", "--source_path"), 0.0
+    source, since = host.flags.source, 0.0
     if source is not None:  # better now than after a training
-        read_scene(source, str(host.value("-i", "--images") or "images"))
+        read_scene(source, host.flags.images)
     if stage == "auto":
         since = time.time() - 1  # file systems round
         log.info("it trains as it is, by itself")
         host.train(quietly=json)
-    elif host.value("-m", "--model_path") is None:
+    elif host.flags.output is None:
         raise UsageError("command", "no -m", "the output folder of the training", "Add -m FOLDER.")
     model = host.saved(since)
     out = model.with_name("pruned.ply" if settings.goal.presses else "control.ply")

@@ -128,9 +128,9 @@ def _expect_thresholds(summary: launch.RunSummary, settings: Settings) -> None:
         SidecarError: it has none: the host moved the file, or wrote another one, after it saved.
     """
     model = summary.model_after
-    if not (model and summary.steps and settings.goal.learns) or sidecar.find(model):
+    if model is None or model.suffix != ".ply":  # a host's checkpoint holds them itself
         return
-    if model.suffix == ".pth":  # a host's checkpoint, which holds them
+    if not (summary.steps and settings.goal.learns) or sidecar.find(model):
         return
     left = sorted(summary.output.rglob(f"*{sidecar.SUFFIX}")) if summary.output else []
     found = f"{sidecar.path_beside(model).name} is not beside it"
