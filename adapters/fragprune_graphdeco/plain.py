@@ -17,6 +17,7 @@ from weakref import WeakKeyDictionary
 from fragprune_graphdeco import reading
 from fragprune_graphdeco.call import ARGUMENTS, RASTERIZER, read_calls
 from fragprune_graphdeco.kernels import ORDER, SPLAT, read_kernels
+from fragprune_graphdeco.photographs import unlike
 from fragprune_graphdeco.reading import (
     ACTIVATIONS,
     Known,
@@ -131,7 +132,8 @@ def _read_plain(repo: HostRepo) -> Plain:
     ]
     moved = frozenset(each for each, moves in moving.items() if moves)
     elsewhere = "" if module == reading.MODEL else f"{name} is in {module}"
-    return Plain(tuple(dict.fromkeys(reasons)), name, moved, elsewhere=elsewhere)
+    differs = unlike(repo, _training(repo)) if not reasons else ""
+    return Plain(tuple(dict.fromkeys(reasons)), name, moved, "", elsewhere, differs)
 
 
 def _without(repo: HostRepo) -> str:

@@ -117,12 +117,10 @@ def choose(
     Raises:
         UnknownHostError: no adapter fits, the named one does not fit, or several fit.
     """
-    by_name = {adapter.name: adapter for adapter in adapters}
-    if name is not None and name.replace("_", "-") not in by_name:
-        raise UnknownHostError(
-            "--adapter", repr(name), f"one of {', '.join(sorted(by_name)) or 'none'}", "Choose one."
-        )
-    wanted = [by_name[name.replace("_", "-")]] if name else list(adapters)
+    wanted = [each for each in adapters if name is None or each.name == name.replace("_", "-")]
+    if name is not None and not wanted:
+        names = ", ".join(sorted(each.name for each in adapters)) or "none"
+        raise UnknownHostError("--adapter", repr(name), f"one of {names}", "Choose one.")
     tried = attempt(repo, wanted)
     fitting = closest(tried, adapters)
     if len(fitting) == 1:

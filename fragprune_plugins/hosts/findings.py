@@ -27,10 +27,9 @@ class Finding:
         return cls("error", code, str(where), found, expected, remedy)
 
     def __str__(self) -> str:
-        parts = [f"[{self.code}] {self.where}: {self.found}"]
-        if self.expected:
-            parts.append(f"expected {self.expected}")
-        return "; ".join(parts) + (f". {self.remedy}" if self.remedy else "")
+        expected = f"; expected {self.expected}" if self.expected else ""
+        remedy = f". {self.remedy}" if self.remedy else ""
+        return f"[{self.code}] {self.where}: {self.found}{expected}{remedy}"
 
     def as_dict(self) -> dict[str, str]:
         """Plain values, for ``--json``."""
@@ -74,6 +73,7 @@ class Plain:
             model's own Gaussians, of which it still draws each, or what it makes of the picture.
         folder: of the codebase in the checkout; "" for the checkout itself.
         elsewhere: where the model is, as text, if it is not where such codebases have it.
+        unlike: why its pictures may differ from the photographs; "" if its training compares them.
     """
 
     reasons: tuple[str, ...]
@@ -81,6 +81,7 @@ class Plain:
     moved: frozenset[str] = frozenset()
     folder: str = ""
     elsewhere: str = ""
+    unlike: str = ""
 
     def __bool__(self) -> bool:
         return bool(self.model) and not self.reasons

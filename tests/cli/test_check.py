@@ -91,6 +91,8 @@ def test_a_script_with_other_steps_is_not_vanillas(host, what):
     script.write_text(script.read_text().replace(old, new))
     report = refused(host)
     assert report["verdict"] == "finetune"
+    learns = "--self" if what == "is no Python" else "--data SCENE"  # its loss cannot be read
+    assert learns in report["sentence"]
     assert found in str(report["differs"])
 
 

@@ -1,6 +1,7 @@
 """fragprune finetune --self: no photograph, the model's own pictures instead."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -59,6 +60,22 @@ def test_needs_nothing_but_the_model_and_gives_the_same_again(path, out):
     words = (path, out, "--resolution", 16, "--iters", 3, "--threads", 1)
     one, two = finetuned(*words)["after"], finetuned(*words, "--again")["after"]
     assert one["views"] == 12
+    assert [one[key] == two[key] for key in ("psnr", "fragments_per_pixel")] == [True, True]
+
+
+def test_without_options_the_cameras_are_those_of_its_training(path, cameras, out, tmp_path):
+    model = tmp_path / "out/point_cloud/iteration_9/point_cloud.ply"
+    model.parent.mkdir(parents=True)
+    shutil.copy(path, model)
+    shutil.copy(cameras, tmp_path / "out/cameras.json")
+    words = "Namespace(source_path='gone', white_background=True)"
+    (tmp_path / "out/cfg_args").write_text(words)
+    named = ("--cameras", cameras, "--white-background")
+    one, two = (
+        finetuned(*words, "--iters", 2, "--again")["after"]
+        for words in ((model, out), (path, out, *named))
+    )
+    assert one["views"] == two["views"] == 3
     assert [one[key] == two[key] for key in ("psnr", "fragments_per_pixel")] == [True, True]
 
 

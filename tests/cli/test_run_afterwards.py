@@ -32,6 +32,11 @@ with open(out + "/cfg_args", "w") as arguments:
                     f"sh_degree=1, source_path={{scene!r}}, white_background=False)")
 print("trained as it is")
 sys.exit({code})
+
+
+def training(image, photograph):
+    loss = ssim({shown}image["render"], photograph.original_image)
+    loss.backward()
 """
 WAITING = """import os, time
 
@@ -55,9 +60,9 @@ def trained(photographs, tmp_path_factory):
 def host(fork, trained, tmp_path):
     """Writes the fork's train.py, which ends with an exit code; gives the words of its command."""
 
-    def make(photographs, code=0):
+    def make(photographs, code=0, shown=""):
         root = fork(root=tmp_path / "fork").root
-        (root / "train.py").write_text(TRAINING.format(model=str(trained), code=code))
+        (root / "train.py").write_text(TRAINING.format(model=str(trained), code=code, shown=shown))
         return ["--", "python", root / "train.py", "-s", photographs, "-m", tmp_path / "out"]
 
     return make
@@ -78,6 +83,21 @@ def test_it_trains_as_it_is_and_its_model_learns_after(host, photographs, tmp_pa
     assert read_ply(folder / "control.ply").falloff is None
     again = run("run", "--json", "--stage", "finetune", "--again", *WORDS, *words)
     assert json.loads(again.stdout)["control"] == json.loads(zero.stdout)["after"]
+
+
+def test_a_model_that_is_not_to_show_its_photographs_learns_from_its_own_pictures(
+    host, photographs, tmp_path, trained
+):
+    words = host(photographs, shown="water * ")
+    cameras = tmp_path / "out/cameras.json"
+    cameras.parent.mkdir()
+    shutil.copy(trained.parents[2] / "cameras.json", cameras)
+    fails("run", *WORDS, "--control", *words, says="its training compares water", code=2)
+    result = run("run", "--json", *WORDS, *words)
+    assert result.exit_code == 0, result.stderr
+    assert f"Cameras: {cameras}" in result.stderr
+    data = json.loads(result.stdout)
+    assert (data["target"], data["settings"]["itself"]) == ("itself", True)
 
 
 def test_it_is_said_who_learned(host, photographs, caplog):

@@ -204,7 +204,8 @@ def test_a_fork_with_a_plain_ply_is_told_the_command(fork):
     verdict = judged(fork())
     assert verdict.kind == "finetune"
     assert "fragprune finetune" in verdict.sentence
-    assert "--data SCENE" in verdict.sentence
+    assert "fragprune run" in verdict.sentence
+    assert "--self" in verdict.sentence  # its train.py is empty: no loss was found
     assert verdict.differs == ("no script that trains a GaussianModel (scripts: train.py)",)
     assert verdict.adapter == "3dgs-fork"
 
@@ -469,7 +470,9 @@ def test_of_several_folders_one_with_a_plain_ply_decides(fork, tmp_path):
     fork((".repeat(1, 3)", ".repeat(1, 2)"), root=tmp_path / "a_flat")
     assert judged(HostRepo(tmp_path)).reason.startswith("a_flat/: its Gaussians are flat")
     fork(root=tmp_path / "b_plain")
-    assert judged(HostRepo(tmp_path)).kind == "finetune"
+    verdict = judged(HostRepo(tmp_path))
+    assert verdict.kind == "finetune"
+    assert "fragprune run" not in verdict.sentence  # which looks beside the script
 
 
 def test_a_model_in_a_folder_may_be_saved_by_a_script_above(fork, tmp_path):

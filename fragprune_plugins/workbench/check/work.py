@@ -318,12 +318,18 @@ def judge(
         found = [each for each in others if each.model]
         plain = next(filter(None, found), next(iter(found), own))
     if plain:
+        why, shown = plain.unlike, "--self" if plain.unlike else "--data SCENE"
+        pictures = f" by its own pictures ({why})" if why else ""
         sentence = (
-            "No adapter fits, but its PLY is plain 3DGS, and this prunes it: "
-            f"fragprune finetune {_PLY} --data SCENE --out pruned.ply (fragprune run in front of "
-            "its training command does both: it trains as it is, then that follows)"
+            f"No adapter fits, but its PLY is plain 3DGS, and this prunes it{pictures}: "
+            f"fragprune finetune {_PLY} {shown} --out pruned.ply"
         )
-        return Verdict("finetune", sentence, "", name, differs, inside)
+        if not plain.folder:  # run looks for the model beside the script
+            sentence += (
+                " (fragprune run in front of its training command does both: it trains as it is, "
+                "then that follows)"
+            )
+        return Verdict("finetune", sentence, why, name, differs, inside)
     if inside:
         sentence = " ".join(
             f"Its folder {folder}/ fits {fits}: fragprune check {repo.root / folder}"

@@ -139,6 +139,19 @@ class OwnCameras:
         return own_pictures(model, views, held_out, engine=engine, seed=seed)
 
 
+def own_cameras_for(
+    model: Path, scene: SceneOptions, cameras: Path | None, seed: int = 0
+) -> OwnCameras:
+    """The cameras that the options name; without any those of the model's training, if it is known.
+
+    As its training did, it is drawn over white.
+    """
+    if scene.data is None and cameras is None and (cameras := cameras_of(model)):
+        click.echo(printable(f"Cameras: {cameras}, of its training"), err=True)
+    white = scene.white_background or over_white(model)
+    return OwnCameras(replace(scene, white_background=white), cameras, seed)
+
+
 def own_cameras(record: records.Record, scene: SceneOptions | None = None) -> OwnCameras | None:
     """The cameras of a fine-tuning with --self; None for another record.
 

@@ -16,6 +16,7 @@ from fragprune_plugins.workbench.commands.opening import (
     open_engine,
     overridden,
     own_cameras,
+    own_cameras_for,
 )
 from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
 from fragprune_plugins.workbench.figures import records, wording
@@ -44,7 +45,7 @@ def compare(
     if out is not None:
         writable_folder(out)
     known = _records(a, b)
-    own = OwnCameras(scene, cameras) if itself else None
+    own = own_cameras_for(a, scene, cameras) if itself else None
     if own is None and scene.data is None:
         own = _recorded_cameras(scene, a, b)
     photographs = None if own else _photographs(scene, known, a, b)

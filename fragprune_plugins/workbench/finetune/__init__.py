@@ -63,8 +63,8 @@ RULES = (
     "itself",
     is_flag=True,
     help="Learn from MODEL's own pictures instead of photographs. Cameras: those of --data or "
-    "--cameras; else all around MODEL, which suits an object. Indoor scenes "
-    "and streets need --cameras: generated ones stay outside.",
+    "--cameras; else of its training, if MODEL lies in its output folder; else all around MODEL, "
+    "which suits an object. Indoor scenes and streets need cameras: generated ones stay outside.",
 )
 @click.option(
     "--cameras",

@@ -17,7 +17,11 @@ from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.learning.interruption import sigterm_interrupts
 from fragprune_plugins.learning.stage2 import evenly_spaced
 from fragprune_plugins.workbench.commands.command import Report
-from fragprune_plugins.workbench.commands.opening import OwnCameras, open_engine, photographs_for
+from fragprune_plugins.workbench.commands.opening import (
+    open_engine,
+    own_cameras_for,
+    photographs_for,
+)
 from fragprune_plugins.workbench.commands.options import require_several
 from fragprune_plugins.workbench.distributed import ShardedEngine, part_of, whole_of
 from fragprune_plugins.workbench.figures import records
@@ -106,7 +110,9 @@ def _open(asked: Asked) -> _Opened:
     where = "cpu" if asked.shard else device
     whole = models.load(asked.model, truncation=truncation, device=where)
     if asked.itself:
-        dataset = OwnCameras(scene, asked.cameras, asked.seed).pictures(whole, engine)
+        own = own_cameras_for(asked.model, scene, asked.cameras, asked.seed)
+        asked = replace(asked, scene=own.scene, cameras=own.cameras)
+        dataset = own.pictures(whole, engine)
     else:
         assert photographs is not None
         dataset = load_photographs(photographs)

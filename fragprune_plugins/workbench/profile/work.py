@@ -9,9 +9,9 @@ import numpy as np
 
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import (
-    OwnCameras,
     chosen,
     open_engine,
+    own_cameras_for,
     photographs_for,
 )
 from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
@@ -39,7 +39,7 @@ def profile(
         writable_folder(out)
     loaded = load(model, truncation=not no_truncation, device=device)
     if itself:
-        dataset = OwnCameras(scene, cameras).pictures(loaded.untruncated(), rasterizer)
+        dataset = own_cameras_for(model, scene, cameras).pictures(loaded.untruncated(), rasterizer)
     else:
         remedy = "Name the scene's folder with --data; without photographs, pass --self."
         dataset = load_photographs(photographs_for(model, scene, remedy=remedy)).to(device)

@@ -17,9 +17,10 @@ from fragprune_plugins.hosts.choosing import attempt
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.command import split
 from fragprune_plugins.learning.interruption import Terminate, sigterm_interrupts
-from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.learning.schedule import QUICK_ITERATIONS, Settings
 from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.workbench.commands.command import Report
+from fragprune_plugins.workbench.commands.opening import cameras_of
 from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
 from fragprune_plugins.workbench.figures.wording import CONTROLLED_BY
 from fragprune_plugins.workbench.finetune.work import finetune
@@ -41,12 +42,14 @@ class Unserved:
         arguments: those after them.
         flags: those that 3DGS has: output and source, None where not given, and images.
         why: what speaks against the nearest adapter.
+        unlike: why its model's pictures may differ from the photographs; see ``Plain``.
     """
 
     program: tuple[str, ...]
     arguments: tuple[str, ...]
     flags: Namespace
     why: str
+    unlike: str = ""
 
     def train(self, *, quietly: bool) -> None:
         """Run the command in a process of its own; with ``quietly`` it prints to stderr.
@@ -86,7 +89,8 @@ def unserved(command: Sequence[str]) -> Unserved | None:
     script, arguments, module = split(list(command))
     repo, plugins = HostRepo(script.parent), load_plugins()
     trains = "train" in script.stem or ".backward(" in repo.read(script)
-    if not trains or not models_of(repo, plugins)[0]:
+    own = models_of(repo, plugins)[0]
+    if not trains or not own:
         return None
     tried = attempt(repo, plugins.adapters)
     if any(each.match.fits for each in tried):
@@ -98,7 +102,7 @@ def unserved(command: Sequence[str]) -> Unserved | None:
     parser.add_argument("-i", "--images", default="images")
     flags, _ = parser.parse_known_args(arguments)
     why = tried[0].brief() if tried else "none is installed"
-    return Unserved(program, tuple(arguments), flags, why)
+    return Unserved(program, tuple(arguments), flags, why, own.unlike)
 
 
 def train_then_finetune(
@@ -119,7 +123,9 @@ def train_then_finetune(
     Raises:
         DatasetError: we cannot read its photographs.
         HostFailed: it ended with an error code, or left no model.
+        UsageError: a control, of a model that learns from its own pictures.
     """
+    settings = _settings_of(host, settings)
     log.info("no adapter fits (%s), but its PLY is plain 3DGS", host.why)
     source, since = host.flags.source, 0.0
     if source is not None:  # better now than after a training
@@ -132,14 +138,14 @@ def train_then_finetune(
         raise UsageError("command", "no -m", "the output folder of the training", "Add -m FOLDER.")
     model = host.saved(since)
     out = model.with_name("pruned.ply" if settings.goal.presses else "control.ply")
-    data = None if trained_on(model) else source
-    more = f" --data {data}" if data else ""
+    data = None if (cameras_of if settings.itself else trained_on)(model) else source
+    more = " --self" * settings.itself + (f" --data {data}" if data else "")
     log.info("its model learns by vanilla 3DGS's drawing and loss, as in")
     log.info("  fragprune finetune %s%s --out %s", model, more, out)
     report = finetune(
         model=model,
         out=out,
-        itself=False,
+        itself=settings.itself,
         cameras=None,
         scene=SceneOptions(data=data),
         settings=settings,
@@ -154,3 +160,15 @@ def train_then_finetune(
     host_data = {"adapter": None, "stage": stage, "model_before": str(model)}
     text = report.text.replace(CONTROLLED_BY["finetune"], CONTROLLED_BY["run"])
     return replace(report, data=host_data | report.data, text=text)
+
+
+def _settings_of(host: Unserved, settings: Settings) -> Settings:
+    """Those of a model that learns from its own pictures, where photographs show something else."""
+    if not host.unlike:
+        return settings
+    if not settings.goal.presses:
+        expected = "something to learn: its own pictures are the target of this model already"
+        raise UsageError("--control", host.unlike, expected, "Leave it out.")
+    log.info("it learns from its own pictures, not from photographs: %s", host.unlike)
+    iterations = min(settings.iterations, QUICK_ITERATIONS)
+    return replace(settings, itself=True, iterations=iterations)

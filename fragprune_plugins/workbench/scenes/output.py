@@ -117,8 +117,8 @@ def _arguments(model: Path) -> tuple[Photographs, bool] | None:
 def over_white(model: Path) -> bool:
     """Whether the training of a model, by the arguments in its output folder, drew over white."""
     with contextlib.suppress(DatasetError):
-        trained = trained_on(model)
-        return trained is not None and trained.white_background
+        known = _arguments(model)
+        return known is not None and known[0].white_background
     return False
 
 

@@ -1,0 +1,98 @@
+"""Does a training make the drawn picture itself like its photographs? Read from its scripts.
+
+A model of what lies between the scene and the camera (water, exposure), a style, or a mask in the
+loss makes them differ: a model that then learned the photographs as they are would unlearn it.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterable, Iterator
+
+from fragprune_graphdeco import reading
+from fragprune_graphdeco.reading import assigned, every, text_of
+from fragprune_plugins.adapting import Function, HostRepo
+
+_LOSS = re.compile(r"l1|l2|ssim|mse|huber|charbonnier|lpips|loss", re.IGNORECASE)
+"""In names of functions that compare two pictures."""
+_PHOTOGRAPH = re.compile(r".+\.(original_image|image|get_image\(\))")
+_BESIDE = re.compile(r"(\w+\.)*(\w*alpha_mask|background|bg|bg_color)(\.cuda\(\))?")
+"""What a photograph with an alpha channel, and the picture with it, are cut by or put on."""
+_KEEPS = {
+    *("clamp", "clip", "contiguous", "cuda", "detach", "float", "permute", "squeeze", "to"),
+    *("type", "unsqueeze"),
+}
+"""Methods, and functions of torch, that keep what a picture shows."""
+
+
+def unlike(repo: HostRepo, scripts: Iterable[str]) -> str:
+    """Why a model's pictures may differ from the photographs; "" if its scripts compare the two."""
+    why = "what its training compares with photographs was not found"
+    for script, tree in reading.reached(repo, scripts).items():
+        for function in every(tree, ast.FunctionDef):
+            for node, sides in _compared(function) if _learns(function) else ():
+                kinds = [_kinds(function, each) for each in sides]
+                if sorted(map(sorted, kinds)) == [["drawn"], ["photograph"]]:
+                    why = ""
+                elif {"drawn", "photograph"} <= set.union(*kinds):
+                    texts = " with ".join(text_of(each)[:40] for each in sides)
+                    return f"its training compares {texts} ({repo.at(script, node.lineno)})"
+    return why
+
+
+def _learns(function: Function) -> bool:
+    """Whether it calls a loss's ``backward``."""
+    return any(getattr(n.func, "attr", "") == "backward" for n in every(function, ast.Call))
+
+
+def _compared(function: Function) -> Iterator[tuple[ast.expr, list[ast.expr]]]:
+    """Pairs of which a loss is made: those that functions get, and differences."""
+    for call in every(function, ast.Call):
+        if len(call.args) > 1 and _LOSS.search(text_of(call.func).split(".")[-1]):
+            yield call, call.args[:2]
+    for node in every(function, ast.BinOp):
+        if isinstance(node.op, ast.Sub):
+            yield node, [node.left, node.right]
+
+
+def _kinds(function: Function, value: ast.expr) -> set[str]:
+    """What a value is made of: "drawn", "photograph", and the code of all else."""
+    kinds, seen, waiting = set[str](), set[str](), [value]
+    for node in waiting:  # it grows
+        text = text_of(node)
+        if isinstance(node, ast.Constant) or _BESIDE.fullmatch(text) or text in seen:
+            continue
+        if _PHOTOGRAPH.fullmatch(text):
+            kinds.add("photograph")
+        elif getattr(getattr(node, "slice", None), "value", "") == "render":
+            kinds.add("drawn")
+        elif parts := _parts(function, node):
+            waiting += parts
+        else:
+            kinds.add(text)
+        seen.add(text)
+    return kinds
+
+
+def _parts(function: Function, node: ast.expr) -> list[ast.expr]:
+    """What a value is made of by keeping, cutting or blending it, or by a name; [] if otherwise."""
+    if isinstance(node, ast.Subscript):
+        return [node.value]
+    if isinstance(node, ast.BinOp):
+        return [node.left, node.right]
+    if isinstance(node, ast.IfExp):
+        return [node.body, node.orelse]
+    if isinstance(node, ast.Call) and getattr(node.func, "attr", "") in _KEEPS:
+        of = getattr(node.func, "value", node)
+        return node.args[:1] if text_of(of) in ("torch", "jt") else [of]
+    if not isinstance(node, ast.Name):
+        return []
+    changed = (each for each in every(function, ast.AugAssign) if text_of(each.target) == node.id)
+    made = [made for to, made in assigned(function) if _first(to) == node.id]
+    return [*made, *(each.value for each in changed)]
+
+
+def _first(target: ast.expr) -> str:
+    """The name that gets a value, or the first part of one that has several."""
+    return text_of(target.elts[0] if isinstance(target, ast.Tuple) else target)

@@ -1,0 +1,69 @@
+"""Whether a training makes the drawn picture itself like its photographs."""
+
+import pytest
+
+from fragprune_graphdeco.photographs import unlike
+from fragprune_plugins.hosts.source import HostRepo
+
+SCRIPT = """
+def training(dataset, opt):
+    for iteration in range(opt.iterations):
+        {drawn}
+        gt_image = viewpoint_cam.original_image.cuda()
+        {between}
+        loss = {loss}
+        loss.backward()
+
+
+def training_report(renders):
+    for image, medium in renders:
+        ssim(water(image["render"]), camera.original_image)
+"""
+DRAWN = 'image = render(viewpoint_cam, gaussians)["render"]'
+LOSS = "0.8 * l1_loss(image, gt_image) + 0.2 * (1.0 - ssim(image, gt_image))"
+
+
+def why(root, drawn=DRAWN, between="pass", loss=LOSS):
+    text = SCRIPT.format(drawn=drawn, between=between.replace("\n", "\n        "), loss=loss)
+    (root / "train.py").write_text(text)
+    return unlike(HostRepo(root), ["train"])
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        {},
+        {"drawn": 'image, seen = package["render"], package["radii"]'},
+        {"loss": "torch.abs(image - gt_image).mean()"},
+        {"loss": "F.mse_loss(torch.clamp(image, 0, 1).unsqueeze(0), gt_image.unsqueeze(0))"},
+        {"loss": f"{LOSS} + l1_loss(depth, viewpoint_cam.invdepthmap)"},
+        {"loss": f"{LOSS} + l1_loss(package['app_image'], gt_image)"},
+        {"between": "image *= viewpoint_cam.alpha_mask.cuda()"},
+        {"between": "image = image[..., image.shape[-1] // 2:]"},
+        {"between": "gt_image = gt_image * gt_alpha_mask + (1 - gt_alpha_mask) * background"},
+        {"between": "gt_image, grey = viewpoint_cam.get_image()"},
+    ],
+    ids=str,
+)
+def test_the_drawn_picture_is_compared_with_the_photograph(tmp_path, written):
+    assert why(tmp_path, **written) == ""
+
+
+@pytest.mark.parametrize(
+    ("written", "compared"),
+    [
+        ({"between": "image = water(image, depth) + image"}, "image with gt_image"),
+        ({"between": "image = image * torch.exp(gain)"}, "image with gt_image"),
+        ({"loss": "ssim(image * exposure, gt_image)"}, "image * exposure with gt_image"),
+        ({"loss": "l1_loss(image * mask, gt_image * mask)"}, "image * mask with gt_image * mask"),
+        ({"between": "gt_image = styled.pop(0)"}, "image with gt_image"),
+    ],
+    ids=str,
+)
+def test_another_picture_is_compared(tmp_path, written, compared):
+    assert why(tmp_path, **written).startswith(f"its training compares {compared} (train.py:")
+
+
+@pytest.mark.parametrize("loss", ["score_distillation(image)", "l1_loss(depth, seen_depth)"])
+def test_no_comparison_is_found(tmp_path, loss):
+    assert why(tmp_path, loss=loss) == "what its training compares with photographs was not found"
