@@ -1,5 +1,6 @@
 """A training's output folder in place of a model, and what is known of the training then."""
 
+import json
 from dataclasses import replace
 
 import pytest
@@ -97,6 +98,34 @@ def test_views_that_a_training_saw_are_not_said_to_be_held_out(data, model, tmp_
     page = (out.parent / "report.html").read_text()
     assert ("nothing learned from it" in page) is held
     assert run_json("finetune", output, *words)["seen"] is not held
+
+
+@pytest.fixture
+def listed(output):
+    """Writes the cameras.json of a training that held these views out."""
+
+    def write(held, at=0.0):
+        rows = tiny.host_cameras(tiny.cameras())
+        for row in rows:
+            row["position"][0] += at
+        rows.sort(key=lambda row: row["id"] not in held)
+        (output / "cameras.json").write_text(json.dumps(rows))
+        return output
+
+    return write
+
+
+@pytest.mark.parametrize(("held", "seen"), [((0, 8), False), ((3, 4), True), ((0,), True)])
+def test_a_training_that_held_other_views_out_has_seen_ours(listed, tmp_path, held, seen):
+    words = ("--out", tmp_path / "r.ply", "--iters", 2, "--train", "opacity")
+    assert run_json("finetune", listed(held), *words)["seen"] is seen
+
+
+@pytest.mark.parametrize(("at", "said"), [(0.0, False), (1e-5, False), (0.5, True)])
+def test_a_training_whose_cameras_were_elsewhere_is_warned_of(listed, tmp_path, at, said):
+    words = ("--out", tmp_path / "r.ply", "--iters", 2, "--train", "opacity")
+    result = run("finetune", listed((0, 8), at), *words)
+    assert ("the camera of view01.png was elsewhere" in result.stderr) is said
 
 
 def test_photographs_that_are_learned_from_too_are_not_said_to_be_held_out(model, tmp_path):

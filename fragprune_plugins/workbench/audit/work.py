@@ -12,12 +12,13 @@ from fragprune_plugins.workbench.audit import page
 from fragprune_plugins.workbench.audit.audit import audit as measured
 from fragprune_plugins.workbench.audit.placing import Placed, Side, place
 from fragprune_plugins.workbench.commands.command import Report
-from fragprune_plugins.workbench.commands.opening import cameras_of, open_engine
+from fragprune_plugins.workbench.commands.opening import open_engine
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.figures.records import strict
 from fragprune_plugins.workbench.figures.wording import nothing_drawn
 from fragprune_plugins.workbench.models.model import load, writable_folder
 from fragprune_plugins.workbench.scenes.cameras import divided, load_cameras, load_scene_cameras
+from fragprune_plugins.workbench.scenes.output import cameras_of
 
 PAGE, FIGURES = "audit.html", "audit.json"
 

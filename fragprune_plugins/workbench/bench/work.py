@@ -16,10 +16,11 @@ from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.bench import timing
 from fragprune_plugins.workbench.bench.scene import make_scene, make_view
 from fragprune_plugins.workbench.commands.command import Report
-from fragprune_plugins.workbench.commands.opening import cameras_of, open_engine
+from fragprune_plugins.workbench.commands.opening import open_engine
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
+from fragprune_plugins.workbench.scenes.output import cameras_of
 
 REPEATS = 9
 """Timed frames of each row."""

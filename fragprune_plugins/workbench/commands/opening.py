@@ -24,10 +24,10 @@ from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 from fragprune_plugins.workbench.scenes.generated import around, own_pictures
 from fragprune_plugins.workbench.scenes.output import (
     ARGUMENTS,
-    CAMERAS,
-    output_folder,
+    cameras_of,
     over_white,
     trained_on,
+    warn_of_seen,
 )
 
 
@@ -54,12 +54,6 @@ def open_engine(options: EngineOptions) -> tuple[Engine, torch.device]:
     return engine_for(options.name, device), device
 
 
-def cameras_of(model: Path) -> Path | None:
-    """The cameras that a host wrote beside a model, if its output folder has them."""
-    folder = output_folder(model)
-    return folder / CAMERAS if folder is not None and (folder / CAMERAS).is_file() else None
-
-
 def photographs_for(
     model: Path, scene: SceneOptions, *, remedy: str = "Name the scene's folder with --data."
 ) -> Photographs:
@@ -73,6 +67,7 @@ def photographs_for(
         DatasetError: the training's arguments cannot be read.
     """
     if scene.data is not None:
+        warn_of_seen(model)
         return overridden(Photographs(scene.data, white_background=over_white(model)), scene)
     trained = trained_on(model)
     if trained is None:

@@ -11,6 +11,7 @@ import click
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.cpu.memory import keep_freed_memory
+from fragprune_plugins.errors import printable
 from fragprune_plugins.files.atomic import locked
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs
@@ -40,7 +41,8 @@ from fragprune_plugins.workbench.pruning import kept
 from fragprune_plugins.workbench.ranks import Ranks, joined, launched
 from fragprune_plugins.workbench.scenes.dataset import Dataset, load_photographs
 from fragprune_plugins.workbench.scenes.generated import views_near
-from fragprune_plugins.workbench.scenes.output import saw_all
+from fragprune_plugins.workbench.scenes.listed import moved, saw_held_out
+from fragprune_plugins.workbench.scenes.output import CAMERAS
 
 _say = partial(click.echo, err=True)
 
@@ -154,6 +156,12 @@ def _warn_of_another_scene(opened: _Opened, dataset: Dataset) -> None:
             f"warning: MODEL shows its photographs at {shown:.1f} dB PSNR, as if they were of "
             "another scene. Check --data, --images, --resolution and --white-background."
         )
+    if not opened.asked.itself and (name := moved(opened.asked.model, dataset)):
+        _say(
+            f"warning: in the training of MODEL the camera of {printable(name)} was elsewhere, by "
+            f"its {CAMERAS}: a model must not learn photographs from cameras other than its own. "
+            "Check --data, or learn from its own pictures with --self."
+        )
 
 
 def _learned(opened: _Opened, ranks: Ranks, lost: float | None) -> tuple[Finetuned, Engine]:
@@ -176,7 +184,7 @@ def _learned(opened: _Opened, ranks: Ranks, lost: float | None) -> tuple[Finetun
         forgotten=lost,
         found=found,
         truncated=ranks.gather(saved.falloff is not None)[0],
-        seen=opened.dataset.leaked > 0 or (not asked.itself and saw_all(asked.model)),
+        seen=not asked.itself and saw_held_out(asked.model, opened.dataset),
         shards=ranks.size if asked.shard else 1,
     )
     return over, engine

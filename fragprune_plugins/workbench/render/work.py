@@ -31,6 +31,7 @@ from fragprune_plugins.workbench.render import filming
 from fragprune_plugins.workbench.scenes.cameras import divided, load_cameras
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
 from fragprune_plugins.workbench.scenes.generated import Named
+from fragprune_plugins.workbench.scenes.output import cameras_of
 
 FPS = 30
 """Frames a second of a film."""
@@ -58,7 +59,7 @@ def render(
     film = out.suffix.lower() == ".mp4"
     _expect_place(out, film=film, shard=shard)
     if scene.data is None and not orbit:
-        cameras = _expect_cameras(cameras or opening.cameras_of(model))
+        cameras = _expect_cameras(cameras or cameras_of(model))
     rasterizer, device = opening.open_engine(engine)
     writable_folder(out.parent if film else out)
     whole = load(model, truncation=not no_truncation, device="cpu" if shard else device)

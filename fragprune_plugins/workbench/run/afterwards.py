@@ -20,13 +20,12 @@ from fragprune_plugins.learning.interruption import Terminate, sigterm_interrupt
 from fragprune_plugins.learning.schedule import QUICK_ITERATIONS, Settings
 from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.workbench.commands.command import Report
-from fragprune_plugins.workbench.commands.opening import cameras_of
 from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
 from fragprune_plugins.workbench.figures.wording import CONTROLLED_BY
 from fragprune_plugins.workbench.finetune.work import finetune
 from fragprune_plugins.workbench.saved import models_of
 from fragprune_plugins.workbench.scenes.dataset import read_scene
-from fragprune_plugins.workbench.scenes.output import trained_on
+from fragprune_plugins.workbench.scenes.output import cameras_of, trained_on
 
 log = logging.getLogger("fragprune")
 

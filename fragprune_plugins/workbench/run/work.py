@@ -44,6 +44,7 @@ from fragprune_plugins.workbench.pruning import kept
 from fragprune_plugins.workbench.run.afterwards import Unserved, train_then_finetune, unserved
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
 from fragprune_plugins.workbench.scenes.generated import views_near
+from fragprune_plugins.workbench.scenes.listed import saw_held_out
 from fragprune_plugins.workbench.scenes.output import saw_all
 
 log = logging.getLogger("fragprune")
@@ -322,7 +323,7 @@ class Looking:
         engine = _AsTheHost(rasterizer.name, rasterizer, drawing)
         model = load(ply, filtered=True, device=device)
         dataset = load_photographs(photographs).to(device)
-        self.seen |= dataset.leaked > 0
+        self.seen |= saw_held_out(ply, dataset)
         trial, left = tried(model, dataset, settings, engine=engine, say=log.info), None
         if trial.keep is not None:
             shots = dataset.train

@@ -64,6 +64,12 @@ def output_folder(model: Path) -> Path | None:
     return folders[2] if inside and folders[0].name.startswith("iteration_") else None
 
 
+def cameras_of(model: Path) -> Path | None:
+    """The cameras that a host wrote beside a model, if its output folder has them."""
+    folder = output_folder(model)
+    return folder / CAMERAS if folder is not None and (folder / CAMERAS).is_file() else None
+
+
 def trained_on(model: Path) -> Photographs | None:
     """The photographs of a model's training, by the arguments in its output folder; else None.
 
@@ -74,14 +80,18 @@ def trained_on(model: Path) -> Photographs | None:
     """
     if (known := _arguments(model)) is None:
         return None
-    photographs, held_out = known
-    if not held_out:
+    warn_of_seen(model)
+    return known[0]
+
+
+def warn_of_seen(model: Path) -> None:
+    """Warn if the training of a model held no view out."""
+    if saw_all(model):
         log.warning(
             "%s was trained without --eval: it has seen the held-out views, so figures on them "
             "flatter it",
             printable(str(output_folder(model))),
         )
-    return photographs
 
 
 def saw_all(model: Path) -> bool:
