@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +11,14 @@ from typing import Any, Literal
 
 from fragprune_plugins.errors import UnknownHostError
 from fragprune_plugins.hosts.adapter import HostAdapter, ScriptAdapter
-from fragprune_plugins.hosts.choosing import Attempt, attempt, closest, locate, usage
+from fragprune_plugins.hosts.choosing import (
+    Attempt,
+    above_of,
+    attempt,
+    closest,
+    locate,
+    usage,
+)
 from fragprune_plugins.hosts.dialect import Dialect, Proof
 from fragprune_plugins.hosts.findings import Finding, Plain
 from fragprune_plugins.hosts.preflight import Missing, install, missing_imports
@@ -64,6 +70,8 @@ def _single(
     elif proved:
         sentence = f"It fits {judged.adapter}, and its rasterizer was proved on this machine."
         judged = replace(judged, sentence=sentence, reason="")
+    elif above := "" if fitting else _above(repo, adapters):
+        judged = replace(judged, sentence=above)
     missing = _missing(repo, verdict.adapter) if verdict else []
     lines = [f"{repo.root}" + (f", commit {repo.commit}" if repo.commit else "")]
     lines += ["", judged.sentence]
@@ -75,8 +83,8 @@ def _single(
     if missing:
         lines += ["", f"Not installed, but imported: {', '.join(map(str, missing))}"]
         lines += [f"  {way}" for way in install(missing).splitlines()]
-    if judged.kind != "inside":
-        lines += ["", _conclusion(repo, fitting, adapters)]
+    if "fragprune check" not in judged.sentence:
+        lines += ["", _conclusion(repo, fitting)]
     data = {
         "host": str(host),
         "commit": repo.commit,
@@ -236,16 +244,23 @@ def _repository(host: Path, adapters: list[HostAdapter], name: str | None) -> Ho
         return repo
 
 
-def _conclusion(repo: HostRepo, fitting: list[Attempt], adapters: list[HostAdapter]) -> str:
+def _above(repo: HostRepo, adapters: list[HostAdapter]) -> str:
+    """That the folder above fits, if scripts of this one use it; else ""."""
+    for above in above_of(repo):
+        for fits in closest(attempt(above, adapters), adapters):
+            return (
+                f"Its scripts use the folder above, which fits {fits.adapter.name}, as run finds: "
+                f"fragprune check {above.root}"
+            )
+    return ""
 
+
+def _conclusion(repo: HostRepo, fitting: list[Attempt]) -> str:
     if len(fitting) == 1:
         return f"Use: {usage(fitting[0].adapter, repo)}"
     if fitting:
         names = ", ".join(each.adapter.name for each in fitting)
         return f"Several adapters fit: {names}. Name one with fragprune run --adapter."
-    with contextlib.suppress(UnknownHostError):  # scripts of this folder may use the one above
-        above, adapter = locate(repo, adapters)
-        return f"The folder above fits {adapter.name}, as run finds: fragprune check {above.root}"
     return (
         "To write an adapter: the documentation's page Write an adapter in 30 minutes, or "
         "python -m pydoc fragprune_plugins.adapting"
