@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 
 import pytest
+import torch
 from cli.commands import fails, run, run_json
 from finetune import tiny
 from PIL import Image
@@ -126,6 +127,19 @@ def test_a_training_whose_cameras_were_elsewhere_is_warned_of(listed, tmp_path, 
     words = ("--out", tmp_path / "r.ply", "--iters", 2, "--train", "opacity")
     result = run("finetune", listed((0, 8), at), *words)
     assert ("the camera of view01.png was elsewhere" in result.stderr) is said
+
+
+@pytest.mark.parametrize(("gain", "refused"), [(1.0, False), (1.2, True)])
+def test_a_model_learns_no_photograph_that_it_shows_under_an_exposure(
+    output, tmp_path, gain, refused
+):
+    rows = (gain * torch.eye(3, 4)).tolist()
+    (output / "exposure.json").write_text(json.dumps({"view00": rows}))
+    words = ("finetune", output, "--out", tmp_path / "r.ply", "--iters", 2)
+    if refused:
+        fails(*words, says=("an exposure for view00", "--self"))
+    else:
+        assert run(*words).exit_code == 0
 
 
 def test_photographs_that_are_learned_from_too_are_not_said_to_be_held_out(model, tmp_path):

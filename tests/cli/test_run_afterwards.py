@@ -100,6 +100,16 @@ def test_a_model_that_is_not_to_show_its_photographs_learns_from_its_own_picture
     assert (data["target"], data["settings"]["itself"]) == ("itself", True)
 
 
+def test_a_model_with_exposures_learns_from_its_own_pictures(host, photographs, tmp_path):
+    words = host(photographs)
+    (tmp_path / "out").mkdir()
+    rows = [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
+    (tmp_path / "out/exposure.json").write_text(json.dumps({"0001": rows}))
+    result = run("run", "--json", *WORDS, *words)
+    assert result.exit_code == 0, result.stderr
+    assert json.loads(result.stdout)["target"] == "itself"
+
+
 def test_it_is_said_who_learned(host, photographs, caplog):
     caplog.set_level("INFO", logger="fragprune")
     result = run("run", *WORDS, *host(photographs))

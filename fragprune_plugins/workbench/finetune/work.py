@@ -11,7 +11,7 @@ import click
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.cpu.memory import keep_freed_memory
-from fragprune_plugins.errors import printable
+from fragprune_plugins.errors import UsageError, printable
 from fragprune_plugins.files.atomic import locked
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs
@@ -41,8 +41,8 @@ from fragprune_plugins.workbench.pruning import kept
 from fragprune_plugins.workbench.ranks import Ranks, joined, launched
 from fragprune_plugins.workbench.scenes.dataset import Dataset, load_photographs
 from fragprune_plugins.workbench.scenes.generated import views_near
-from fragprune_plugins.workbench.scenes.listed import moved, saw_held_out
 from fragprune_plugins.workbench.scenes.output import CAMERAS
+from fragprune_plugins.workbench.scenes.training import exposed, moved, saw_held_out
 
 _say = partial(click.echo, err=True)
 
@@ -106,6 +106,13 @@ def _open(asked: Asked) -> _Opened:
     if scene.data is not None or not asked.itself:
         remedy = "Pass --data FOLDER with photographs; without any, --self."
         photographs = photographs_for(asked.model, scene, remedy=remedy)
+        if not asked.itself and (name := exposed(asked.model)):
+            raise UsageError(
+                "MODEL",
+                f"its training learned an exposure for {printable(name)}: exposure.json",
+                "a model whose pictures are like its photographs as they are",
+                "Learn from its own pictures: --self.",
+            )
     engine, device = open_engine(asked.engine)
     keep_freed_memory()
     truncation = settings.goal.presses and not asked.no_truncation

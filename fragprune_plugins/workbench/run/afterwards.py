@@ -26,6 +26,7 @@ from fragprune_plugins.workbench.finetune.work import finetune
 from fragprune_plugins.workbench.saved import models_of
 from fragprune_plugins.workbench.scenes.dataset import read_scene
 from fragprune_plugins.workbench.scenes.output import cameras_of, trained_on
+from fragprune_plugins.workbench.scenes.training import exposed
 
 log = logging.getLogger("fragprune")
 
@@ -124,7 +125,7 @@ def train_then_finetune(
         HostFailed: it ended with an error code, or left no model.
         UsageError: a control, of a model that learns from its own pictures.
     """
-    settings = _settings_of(host, settings)
+    settings = _settings_of(host.unlike, settings)
     log.info("no adapter fits (%s), but its PLY is plain 3DGS", host.why)
     source, since = host.flags.source, 0.0
     if source is not None:  # better now than after a training
@@ -136,6 +137,8 @@ def train_then_finetune(
     elif host.flags.output is None:
         raise UsageError("command", "no -m", "the output folder of the training", "Add -m FOLDER.")
     model = host.saved(since)
+    if not host.unlike and (name := exposed(model)):
+        settings = _settings_of(f"it learned an exposure for {name}", settings)
     out = model.with_name("pruned.ply" if settings.goal.presses else "control.ply")
     data = None if (cameras_of if settings.itself else trained_on)(model) else source
     more = " --self" * settings.itself + (f" --data {data}" if data else "")
@@ -161,13 +164,13 @@ def train_then_finetune(
     return replace(report, data=host_data | report.data, text=text)
 
 
-def _settings_of(host: Unserved, settings: Settings) -> Settings:
+def _settings_of(unlike: str, settings: Settings) -> Settings:
     """Those of a model that learns from its own pictures, where photographs show something else."""
-    if not host.unlike:
+    if not unlike:
         return settings
     if not settings.goal.presses:
         expected = "something to learn: its own pictures are the target of this model already"
-        raise UsageError("--control", host.unlike, expected, "Leave it out.")
-    log.info("it learns from its own pictures, not from photographs: %s", host.unlike)
+        raise UsageError("--control", unlike, expected, "Leave it out.")
+    log.info("it learns from its own pictures, not from photographs: %s", unlike)
     iterations = min(settings.iterations, QUICK_ITERATIONS)
     return replace(settings, itself=True, iterations=iterations)

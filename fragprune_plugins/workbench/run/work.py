@@ -44,8 +44,8 @@ from fragprune_plugins.workbench.pruning import kept
 from fragprune_plugins.workbench.run.afterwards import Unserved, train_then_finetune, unserved
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
 from fragprune_plugins.workbench.scenes.generated import views_near
-from fragprune_plugins.workbench.scenes.listed import saw_held_out
 from fragprune_plugins.workbench.scenes.output import saw_all
+from fragprune_plugins.workbench.scenes.training import saw_held_out
 
 log = logging.getLogger("fragprune")
 

@@ -1,4 +1,4 @@
-"""What the ``cameras.json`` of a model's training tells of photographs: held out, or elsewhere."""
+"""What a training left beside its model tells of photographs: held out, elsewhere, or exposed."""
 
 from __future__ import annotations
 
@@ -6,14 +6,27 @@ import contextlib
 from itertools import islice
 from pathlib import Path
 
+import torch
+
 from fragprune_plugins.errors import DatasetError
+from fragprune_plugins.files.reading import UntrustedFile
 from fragprune_plugins.types import View
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
 from fragprune_plugins.workbench.scenes.dataset import Dataset
-from fragprune_plugins.workbench.scenes.output import cameras_of, saw_all
+from fragprune_plugins.workbench.scenes.output import cameras_of, output_folder, saw_all
+from fragprune_plugins.workbench.scenes.transforms import matrix
 
 _FAR = 0.01
 """Of the cameras' extent, or of a turn in radians: other worlds are further, files round less."""
+_NEUTRAL = 1e-3
+"""Of exposures: a change that no 8-bit level shows."""
+
+_EXPOSURES = UntrustedFile(
+    DatasetError,
+    "not readable as exposures",
+    "the exposure.json that a host wrote",
+    "Remove it if its exposures are neutral.",
+)
 
 
 def saw_held_out(model: Path, dataset: Dataset) -> bool:
@@ -39,6 +52,27 @@ def moved(model: Path, dataset: Dataset) -> str:
             far = (was.campos - shot.view.campos.cpu()).norm()
             if turned > _FAR or far > _FAR * extent:
                 return shot.name
+    return ""
+
+
+def exposed(model: Path) -> str:
+    """The name of a photograph that a training learned an exposure for; "" if there is none.
+
+    What it drew had to be like the photograph only under that exposure. Hosts keep them as
+    ``exposure.json``: the rows of a (3, 4) matrix by name, the identity if they learned none.
+
+    Raises:
+        DatasetError: the file cannot be read.
+    """
+    folder = output_folder(model)
+    path = folder / "exposure.json" if folder else None
+    if path is None or not path.is_file():
+        return ""
+    with _EXPOSURES.reading(path) as reading:
+        for name, rows in reading.json().items():
+            reading.place = name
+            if (matrix(rows, (3, 4)) - torch.eye(3, 4)).abs().max() > _NEUTRAL:
+                return str(name)
     return ""
 
 
