@@ -31,6 +31,7 @@ from fragprune_3dgs_fork.fork import (
 )
 from fragprune_3dgs_fork.rasterizer import POSES, Output
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, kernels, plain, reading
+from fragprune_graphdeco.photographs import NOT_FOUND, unlike
 from fragprune_plugins.adapting import (
     CommandLine,
     EngineError,
@@ -450,11 +451,16 @@ class ForkAdapter(GraphdecoAdapter):
             )
 
     def not_drawn(self, repo: HostRepo, arguments: list[str]) -> list[str]:
-        """Also what makes a picture beside the PLY: a network that moves or colours Gaussians."""
+        """Also what makes a picture beside the PLY: a network that moves or colours Gaussians, or a
+        script that compares another picture with the photographs.
+        """
         by = [f"--{name}" for name in read_fork(repo).colours if f"--{name}" in arguments]
         why = [*by, *sorted(plain.read_plain(repo).moved)]
         beside = [f"a PLY is not all that it draws: {each}" for each in why]
-        return beside + super().not_drawn(repo, arguments)
+        other = unlike(repo, map(reading.module_of, read_fork(repo).scripts))
+        return (
+            beside + [other] * (other not in ("", NOT_FOUND)) + super().not_drawn(repo, arguments)
+        )
 
     def densified(self, repo: HostRepo, script: Path, arguments: list[str]) -> int | None:
         """As 3DGS tells, if scripts change the model only until then; else unknown."""

@@ -14,6 +14,8 @@ from fragprune_graphdeco import reading
 from fragprune_graphdeco.reading import assigned, every, text_of
 from fragprune_plugins.adapting import Function, HostRepo
 
+NOT_FOUND = "what its training compares with photographs was not found"
+
 _LOSS = re.compile(r"l1|l2|ssim|mse|huber|charbonnier|lpips|loss", re.IGNORECASE)
 """In names of functions that compare two pictures."""
 _PHOTOGRAPH = re.compile(r".+\.(original_image|image|get_image\(\))")
@@ -28,7 +30,7 @@ _KEEPS = {
 
 def unlike(repo: HostRepo, scripts: Iterable[str]) -> str:
     """Why a model's pictures may differ from the photographs; "" if its scripts compare the two."""
-    why = "what its training compares with photographs was not found"
+    why = NOT_FOUND
     for script, tree in reading.reached(repo, scripts).items():
         for function in every(tree, ast.FunctionDef):
             for node, sides in _compared(function) if _learns(function) else ():

@@ -1,5 +1,6 @@
 """A fork is served if reading shows that its model is plain, and refused by name if not."""
 
+from contextlib import nullcontext
 from functools import partial
 from types import SimpleNamespace
 
@@ -689,6 +690,17 @@ def test_pictures_of_a_network_are_not_compared(tmp_path):
     assert ForkAdapter().drawing(repo, []) == {}
     with pytest.raises(NotComparedError, match="--network"):
         ForkAdapter().drawing(repo, ["--network"])
+
+
+@pytest.mark.parametrize(("shown", "compared"), [("", True), ("water * ", False)])
+def test_pictures_that_are_not_to_be_like_the_photographs_are_not_compared(
+    tmp_path, shown, compared
+):
+    loss = f"loss = ssim({shown}package['render'], camera.original_image)"
+    repo = fork(tmp_path, ("        loss.backward()", f"        {loss}\n        loss.backward()"))
+    assert errors(repo) == []
+    with nullcontext() if compared else pytest.raises(NotComparedError, match="compares water"):
+        ForkAdapter().drawing(repo, [])
 
 
 KEYS = '    return {"render"'
