@@ -30,8 +30,14 @@ from fragprune_3dgs_fork.fork import (
     rests_after_densification,
 )
 from fragprune_3dgs_fork.rasterizer import POSES, Output
-from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, kernels, plain, reading
-from fragprune_graphdeco.photographs import NOT_FOUND, unlike
+from fragprune_graphdeco import (
+    GraphdecoAdapter,
+    GraphdecoDialect,
+    kernels,
+    photographs,
+    plain,
+    reading,
+)
 from fragprune_plugins.adapting import (
     CommandLine,
     EngineError,
@@ -457,10 +463,9 @@ class ForkAdapter(GraphdecoAdapter):
         by = [f"--{name}" for name in read_fork(repo).colours if f"--{name}" in arguments]
         why = [*by, *sorted(plain.read_plain(repo).moved)]
         beside = [f"a PLY is not all that it draws: {each}" for each in why]
-        other = unlike(repo, map(reading.module_of, read_fork(repo).scripts))
-        return (
-            beside + [other] * (other not in ("", NOT_FOUND)) + super().not_drawn(repo, arguments)
-        )
+        other = photographs.unlike(repo, map(reading.module_of, read_fork(repo).scripts))
+        beside += [other] * (other not in ("", photographs.NOT_FOUND))
+        return beside + super().not_drawn(repo, arguments)
 
     def densified(self, repo: HostRepo, script: Path, arguments: list[str]) -> int | None:
         """As 3DGS tells, if scripts change the model only until then; else unknown."""

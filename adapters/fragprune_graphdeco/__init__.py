@@ -5,6 +5,7 @@ call          the rasterizer's call in their source
 densifying    the rows that their densify methods copy
 reading       the getters and the flags that every adapter needs
 kernels       the rule in the CUDA sources of a vendored rasterizer
+photographs   whether a training makes the drawn picture itself like its photographs
 plain         whether the PLY that a codebase saves is plain 3DGS
 proof         proves their rasterizers: it draws by both, and ``likeness`` compares
 stand_ins     modules of ours for their compiled packages
