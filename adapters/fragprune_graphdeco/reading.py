@@ -21,6 +21,7 @@ from fragprune_plugins.adapting import (
     imported,
     is_off,
     nodes,
+    off_by_default,
 )
 
 MODEL = "scene.gaussian_model"
@@ -160,6 +161,7 @@ def failing(repo: HostRepo, scripts: Collection[str]) -> list[str]:
     saving = text_of(repo.function("scene", "Scene.save") or ast.Pass())
     if re.search(r"\b(os\.(replace|rename)|shutil\.move)\(", saving):
         found.append("Scene.save renames the PLY that it saves, and loses its thresholds")
+    found += [*_left_out(repo, scripts)][:1]
     for script in scripts:
         tree, home = repo.tree(module_of(script)), home_of(repo, module_of(script))
         found += [f"{script} trains the GaussianModel of {home}"] * (
@@ -174,7 +176,40 @@ def failing(repo: HostRepo, scripts: Collection[str]) -> list[str]:
         ]
         module = module_of(script)
         found += (*_misfits(repo, module), *_absent(repo, module), *_own_folders(repo, module))[:1]
+        found += [f"{script} draws by {each}" for each in _drawn_elsewhere(repo, module)][:1]
     return found
+
+
+def _left_out(repo: HostRepo, scripts: Iterable[str]) -> Iterator[str]:
+    """Rows of the model that its PLY lacks, always or by what a call of ``save_ply`` names."""
+    save = repo.function(MODEL, "GaussianModel.save_ply")
+    taken = repo.parameters(MODEL, "GaussianModel.save_ply") or ()
+    trees = map(repo.tree, ("scene", *map(module_of, scripts)))
+    calls = [each for tree in trees for each in every(tree, ast.Call)]
+    saving = [passed(each, taken) for each in calls if getattr(each.func, "attr", "") == "save_ply"]
+    named = {name for each in saving for name, value in each.items() if not is_off(value)}
+    off = off_by_default(save) - named if save else set()
+    gone = skipped(save, lambda node: [None] if getattr(node, "id", "") in off else [])
+    for each in every(save, ast.Subscript):
+        chosen = not isinstance(each.slice, ast.Slice | ast.Tuple | ast.Constant)
+        if chosen and each not in gone and _ROWS.fullmatch(text_of(each.value)):
+            yield f"save_ply leaves out rows, {text_of(each)} ({repo.at(MODEL, each.lineno)})"
+
+
+_ROWS = re.compile(r"xyz|self\.(_|get_)xyz(\.\w+\(\))*")
+"""The positions of a model, in its save function."""
+
+
+def _drawn_elsewhere(repo: HostRepo, module: str) -> Iterator[str]:
+    """Functions beside ``gaussian_renderer`` by which a script draws, where that has its own."""
+    usual = "gaussian_renderer"
+    for node in every(repo.tree(module), ast.ImportFrom):
+        beside = repo.absolute(module, node)
+        for each in node.names if beside.startswith(f"{usual}.") else ():
+            home, body = _definition(repo, beside, each.name)
+            own = _definition(repo, usual, each.name)[0]
+            if own and home != own and "GaussianRasterizer(" in text_of(body or ast.Pass()):
+                yield f"{each.name} of {home}, not of {usual}"
 
 
 @lru_cache(maxsize=64)

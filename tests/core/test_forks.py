@@ -941,6 +941,48 @@ def test_the_model_that_the_scene_exports_is_the_one_that_is_read(tmp_path):
     assert "train.py trains the GaussianModel of scene.late_model" in errors(HostRepo(tmp_path))[0]
 
 
+SAVED = "    def save_ply(self, path): ..."
+CHOSEN = """    def save_ply(self, path, kept=None):
+        xyz, opacities = self._xyz.detach().cpu(), self._opacity.detach().cpu()
+        if kept is not None:
+            xyz, opacities = xyz[kept], opacities[kept]
+        write(path, xyz, opacities)"""
+LEFT_OUT = {
+    "where a script names them": (
+        CHOSEN,
+        "scene.save(iteration), gaussians.save_ply(path, kept=bright)",
+        True,
+    ),
+    "in place": (CHOSEN, "gaussians.save_ply(path, bright)", True),
+    "always": (SAVED.replace("...", "write(path, self._xyz[self.kept])"), "scene.save(9)", True),
+    "where nobody names them": (CHOSEN, "gaussians.save_ply(path)", False),
+    "where they are None": (CHOSEN, "gaussians.save_ply(path, kept=None)", False),
+    "not at all": (SAVED.replace("...", "write(path, self._xyz[:, 0])"), "scene.save(9)", False),
+}
+
+
+@pytest.mark.parametrize("what", LEFT_OUT)
+def test_a_ply_of_other_rows_than_the_models_has_no_thresholds(tmp_path, what):
+    save, call, refused = LEFT_OUT[what]
+    found = "; ".join(errors(fork(tmp_path, (SAVED, save), ("scene.save(iteration)", call))))
+    assert ("save_ply leaves out rows" in found) == refused
+    assert bool(found) == refused
+
+
+ELSEWHERE = ("from gaussian_renderer import", "from gaussian_renderer.mine import")
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_a_script_draws_by_a_function_that_has_a_seam(tmp_path, again):
+    repo = fork(tmp_path, ELSEWHERE)
+    usual = tmp_path / "gaussian_renderer/__init__.py"
+    (tmp_path / "gaussian_renderer/mine.py").write_text(usual.read_text())
+    if again:
+        usual.write_text("from gaussian_renderer.mine import render\n")
+    found = "; ".join(errors(repo))
+    assert ("train.py draws by render of gaussian_renderer.mine" in found) == (not again)
+
+
 def test_what_a_script_changes_until_densification_ends_ends_before_stage_2(tmp_path):
     repo = fork(tmp_path, (STATEMENT, CLAMPS))
     assert errors(repo) == []
