@@ -8,6 +8,7 @@ from fragprune_plugins.hosts.choosing import attempt
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.workbench.check.work import judge
+from fragprune_plugins.workbench.run.afterwards import unserved
 
 MODEL = """
     def setup_functions(self):
@@ -480,6 +481,17 @@ def test_a_model_in_a_folder_may_be_saved_by_a_script_above(fork, tmp_path):
     assert judged(HostRepo(tmp_path)).reason == "inner/: none of its scripts saves a PLY"
     (tmp_path / "slam.py").write_text("scene.save(3)\n")
     assert judged(HostRepo(tmp_path)).kind == "finetune"
+
+
+@pytest.mark.parametrize("inner", ["", "inner"])
+def test_run_is_named_where_it_would_train(fork, tmp_path, inner):
+    """``unserved`` takes what the codebase itself saves, not what a folder of it does."""
+    fork(root=tmp_path / inner)
+    (tmp_path / "train.py").write_text("scene.save(3)\n")
+    verdict = judged(HostRepo(tmp_path))
+    assert verdict.kind == "finetune"
+    named = "fragprune run in front of its training command" in verdict.sentence
+    assert named == bool(unserved([str(tmp_path / "train.py")])) == (not inner)
 
 
 @pytest.mark.parametrize(

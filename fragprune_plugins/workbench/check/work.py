@@ -339,7 +339,7 @@ def judge(
             f"No adapter fits, but its PLY is plain 3DGS, and this prunes it{pictures}: "
             f"fragprune finetune {_PLY} {shown} --out pruned.ply"
         )
-        if not plain.folder:  # run looks for the model beside the script
+        if plain is own:  # what a folder saves, run does not look for
             sentence += (
                 " (fragprune run in front of its training command does both: it trains as it is, "
                 "then that follows)"
