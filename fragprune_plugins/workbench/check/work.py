@@ -333,10 +333,9 @@ def judge(
         found = [each for each in others if each.model]
         plain = next(filter(None, found), next(iter(found), own))
     if plain:
-        why, shown = plain.unlike, "--self" if plain.unlike else "--data SCENE"
-        pictures = f" by its own pictures ({why})" if why else ""
+        shown = "--self" if plain.unlike else "--data SCENE"
         sentence = (
-            f"No adapter fits, but its PLY is plain 3DGS, and this prunes it{pictures}: "
+            "No adapter fits, but its PLY is plain 3DGS, and this prunes it: "
             f"fragprune finetune {_PLY} {shown} --out pruned.ply"
         )
         if plain is own:  # what a folder saves, run does not look for
@@ -344,7 +343,9 @@ def judge(
                 " (fragprune run in front of its training command does both: it trains as it is, "
                 "then that follows)"
             )
-        return Verdict("finetune", sentence, why, name, differs, inside)
+        if plain.unlike:
+            sentence += f". It is not to learn from photographs: {plain.unlike}"
+        return Verdict("finetune", sentence, plain.unlike, name, differs, inside)
     if inside:
         sentence = " ".join(
             f"Its folder {folder}/ fits {fits}: fragprune check {repo.root / folder}"
