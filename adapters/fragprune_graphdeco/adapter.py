@@ -486,11 +486,13 @@ class GraphdecoAdapter(ScriptAdapter):
                 "views that are held out",
                 f"Train with {line.hold_out[-1]}, from stage 1 on.",
             )
+        projection = repo.function("utils.graphics_utils", "getProjectionMatrix")
         return Photographs(
             Path(flags.source or ""),
             resolution(repo, flags.resolution),
             bool(flags.white_background),
             flags.images or "images",
+            centred=projection is None or "cx" not in text_of(projection),
         )
 
     def not_drawn(self, repo: HostRepo, arguments: list[str]) -> list[str]:

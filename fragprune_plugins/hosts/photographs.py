@@ -43,10 +43,7 @@ class Resolution:
         return cls(width=WIDEST if value < 1 else value, shrink_only=value < 1)
 
     def of(self, width: int, height: int) -> tuple[int, int]:
-        """The size at which an image of this size is read, at least one pixel a side.
-
-        The rounding is the hosts' own, because one more pixel would make another picture.
-        """
+        """The size at which hosts read an image of this size, to the pixel; at least one a side."""
         if self.width is None:
             return max(1, round(width / self.divide)), max(1, round(height / self.divide))
         if self.shrink_only and width <= self.width:
@@ -64,9 +61,11 @@ class Photographs:
         resolution: of the images.
         white_background: images with alpha are composited over white instead of black.
         images: name of the folder of a COLMAP scene that holds the images.
+        centred: the host takes the middle of a picture for its principal point, as 3DGS does.
     """
 
     folder: Path
     resolution: Resolution = Resolution()
     white_background: bool = False
     images: str = "images"
+    centred: bool = False

@@ -42,6 +42,23 @@ def test_options_override_the_training(output):
     fails("profile", output, "--images", "images_2", says="images_2", code=1)
 
 
+def test_pictures_are_drawn_as_the_training_did_around_the_middle(output, data, tmp_path):
+    """3DGS ignores the principal point, and so do its descendants."""
+    lens = f"7 PINHOLE {tiny.SIDE} {tiny.SIDE} 36 36"
+    psnr = {}
+    for name, centre in (("own", "20 16"), ("middle", "16 16")):
+        (data / "sparse" / "0" / "cameras.txt").write_text(f"{lens} {centre}\n")
+        psnr[name] = run_json("profile", output)["psnr"]
+        for more in (("--data", data), ("--out", tmp_path / "pictures")):
+            assert run_json("profile", output, *more)["psnr"] == psnr[name]
+        assert run_json("compare", output, output, "--data", data)["a"]["psnr"] == psnr[name]
+    assert psnr["own"] == psnr["middle"]
+    run_json("finetune", output, "--out", pruned := tmp_path / "pruned.ply", "--iters", 2)
+    psnr = run_json("profile", pruned, "--data", data)["psnr"]  # of "middle"
+    (data / "sparse" / "0" / "cameras.txt").write_text(f"{lens} 20 16\n")
+    assert run_json("profile", pruned, "--data", data)["psnr"] == psnr
+
+
 @pytest.mark.parametrize("white", [True, False])
 def test_beside_data_the_training_says_whether_it_drew_over_white(data, model, tmp_path, white):
     known = tiny.host_output(tmp_path / "out", data, model, white_background=white)
@@ -167,7 +184,7 @@ def test_the_size_of_photographs_is_the_hosts(data, model, tmp_path, asked):
         tmp_path / "out", data, model, resolution=asked, white_background=True, images="images_8"
     )
     model_file = output / "point_cloud" / "iteration_900" / "point_cloud.ply"
-    assert trained_on(model_file) == Photographs(data, SIZES[asked], True, "images_8")
+    assert trained_on(model_file) == Photographs(data, SIZES[asked], True, "images_8", centred=True)
 
 
 @pytest.mark.parametrize(

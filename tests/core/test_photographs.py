@@ -1,5 +1,6 @@
 """Photographs are read at the size that the host reads them at, or refused."""
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -78,8 +79,17 @@ def test_another_way_of_choosing_the_size_is_refused(tmp_path, source):
 
 def test_folder_background_and_images_are_the_commands():
     read = command("-w", "--images", "images_4")
-    assert read == Photographs(Path("scene"), read.resolution, True, "images_4")
+    assert read == Photographs(Path("scene"), read.resolution, True, "images_4", centred=True)
     assert not command().white_background
+
+
+def test_the_middle_is_the_principal_point_of_a_host_that_reads_no_other(tmp_path):
+    assert command().centred
+    shutil.copytree(HOST.root, tmp_path, dirs_exist_ok=True)
+    source = tmp_path / "utils" / "graphics_utils.py"
+    with source.open("a") as file:
+        file.write("def getProjectionMatrix(znear, zfar, fovX, fovY, cx=None):\n    P[3, 2] = 1\n")
+    assert not Vanilla3DGS().photographs(HostRepo(tmp_path), ["-s", "scene", "--eval"]).centred
 
 
 def test_a_command_that_holds_nothing_out_is_refused():
@@ -92,7 +102,7 @@ def test_a_command_that_holds_nothing_out_is_refused():
     [Resolution(), Resolution(4), Resolution(width=7), Resolution(width=9, shrink_only=True)],
 )
 def test_photographs_survive_a_record(size, tmp_path):
-    said = Recorded(Photographs(tmp_path, size, True, "images_2"), (tmp_path / "a.ply",))
+    said = Recorded(Photographs(tmp_path, size, True, "images_2", True), (tmp_path / "a.ply",))
     path = records.leave(tmp_path / "a.ply", "run", {"photographs": said.as_dict()})
     (record,) = records.find(path.parent)
     assert recorded(record) == said

@@ -72,6 +72,18 @@ def test_off_centre_principal_point(colmap):
     assert float(clip[0] / clip[3] + 1) * tiny.SIDE / 2 == pytest.approx(20, abs=1e-4)
 
 
+def test_hosts_of_3dgs_take_the_middle_for_the_principal_point(colmap, caplog):
+    whole = load_dataset(colmap).train[0]
+    line = f"7 PINHOLE {tiny.SIDE} {tiny.SIDE} 36 36 20 16\n"
+    (colmap / SPARSE / "cameras.txt").write_text(line)
+    shot = load_dataset(colmap, centred=True).train[0]
+    assert torch.equal(shot.view.projmatrix, whole.view.projmatrix)
+    assert torch.equal(shot.image, whole.image)
+    assert not caplog.text
+    load_dataset(colmap)
+    assert "principal point is up to 4.0 pixels off" in caplog.text
+
+
 def test_extent_is_the_hosts(colmap):
     dataset = load_dataset(colmap)
     centres = torch.stack([shot.view.campos for shot in dataset.train])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,7 +12,7 @@ import click
 import torch
 
 from fragprune_plugins.engines import Engine, device_for
-from fragprune_plugins.errors import UsageError, printable
+from fragprune_plugins.errors import RecordError, UsageError, printable
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.plugins.hooks import engine_for
@@ -25,9 +26,9 @@ from fragprune_plugins.workbench.scenes.generated import around, own_pictures
 from fragprune_plugins.workbench.scenes.output import (
     ARGUMENTS,
     cameras_of,
+    drawn_as_trained,
     over_white,
     trained_on,
-    warn_of_seen,
 )
 
 
@@ -60,15 +61,20 @@ def photographs_for(
     """The photographs that the options name; without --data those that the model was trained on.
 
     Options that were given override what the training says. Beside --data it still says whether
-    the model was drawn over white.
+    the model was drawn over white, and around the middle; so does the record of a fine-tuning.
 
     Raises:
         UsageError: there is no folder, and the model lies in no output folder with arguments.
         DatasetError: the training's arguments cannot be read.
     """
     if scene.data is not None:
-        warn_of_seen(model)
-        return overridden(Photographs(scene.data, white_background=over_white(model)), scene)
+        photographs = drawn_as_trained(scene.data, model)
+        with contextlib.suppress(RecordError):
+            record = records.beside(model)
+            if record is not None and (read := records.recorded(record)):
+                known = read.photographs
+                photographs = replace(known, folder=scene.data, resolution=Resolution())
+        return overridden(replace(photographs, images="images"), scene)
     trained = trained_on(model)
     if trained is None:
         raise UsageError(

@@ -24,7 +24,7 @@ from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
 from fragprune_plugins.workbench.figures.pictures import leave_panels
 from fragprune_plugins.workbench.models.model import load, writable_folder
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
-from fragprune_plugins.workbench.scenes.output import over_white, trained_on, warn_of_seen
+from fragprune_plugins.workbench.scenes.output import drawn_as_trained, trained_on
 
 
 def compare(
@@ -150,7 +150,4 @@ def _photographs(
             "a scene folder, or A's own pictures",
             "Name it with --data; without photographs, pass --self.",
         )
-    for each in models:
-        warn_of_seen(each)
-    white = any(map(over_white, models))
-    return overridden(Photographs(scene.data, white_background=white), scene)
+    return overridden(drawn_as_trained(scene.data, *models), scene)

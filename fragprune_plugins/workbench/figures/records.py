@@ -203,7 +203,8 @@ def recorded(record: Record) -> Recorded | None:
                 raise ValueError(f"{name} is {value!r}")
         filtered = bool(values["filtered"])
         scene, size = located(values["folder"], folder), Resolution(**values["resolution"])
-        photographs = Photographs(scene, size, values["white_background"], values["images"])
+        white, images = values["white_background"], values["images"]
+        photographs = Photographs(scene, size, white, images, bool(values.get("centred")))
         return Recorded(photographs, models, filtered, drawing)
 
 

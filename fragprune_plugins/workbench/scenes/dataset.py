@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from fragprune_plugins.workbench.scenes.lenses import Pixels
 
 _ASPECT_TOLERANCE = 0.01
+_OFF_CENTRE = 0.5  # pixels
 _ROWS = 256  # of a picture, composited at a time
 _SEEN = 128  # grey levels of a mask, from which on the photograph is looked at
 _SMALLER = ("images_2", "images_4", "images_8")
@@ -237,6 +238,7 @@ def load_dataset(
     resolution: int | Resolution = 1,
     white_background: bool = False,
     images: str = "images",
+    centred: bool = False,
 ) -> Dataset:
     """Read a COLMAP folder (sparse/, images/), or Blender's or nerfstudio's transforms files.
 
@@ -249,6 +251,7 @@ def load_dataset(
         white_background: composite images with alpha over white instead of black, and render so.
         images: name of the image folder, if it is not ``images`` or not what the transforms say.
             Without ``images/``, the largest of ``images_2``, ``images_4`` and ``images_8`` serves.
+        centred: render as if each principal point was the middle of its picture, as 3DGS does.
 
     Raises:
         DatasetError: the folder has neither layout or both, an image is missing, a camera model is
@@ -256,11 +259,19 @@ def load_dataset(
     """
     background = torch.full((3,), float(white_background))
     size = resolution if isinstance(resolution, Resolution) else Resolution(divide=resolution)
-    train, test = (
-        [make_shot(row, background, size) for row in part]
-        for part in read_scene(Path(folder), images)
-    )
+    rows = read_scene(Path(folder), images)
+    train, test = ([make_shot(row, background, size, centred) for row in part] for part in rows)
     dataset = Dataset(train, test)
+    off = max(
+        (row.camera.off_centre for part in rows for row in part if row.lens is None), default=0
+    )
+    if off > _OFF_CENTRE and not centred and not transforms.has_transforms(Path(folder)):
+        log.warning(
+            "%s: the principal point is up to %.1f pixels off the middle. 3DGS and most of its "
+            "descendants ignore that: pass a model of theirs in its output folder, with cfg_args, "
+            "or its figures are wrong",
+            *(printable(str(folder)), off),
+        )
     if dataset.leaked:
         log.warning(
             "%s: %d of the %d held-out views are training views too, so figures on them flatter: "
@@ -320,13 +331,17 @@ def _image_folder(folder: Path, images: str) -> str:
     return images
 
 
-def make_shot(row: Posed, background: Tensor, resolution: Resolution) -> Photograph:
+def make_shot(
+    row: Posed, background: Tensor, resolution: Resolution, centred: bool = False
+) -> Photograph:
     """Pair an image file with its camera. This reads only the file's header."""
     width, height = image_size(row.image)
     camera = row.camera
     _expect_aspect(row.image, (width, height), "its camera", (camera.width, camera.height))
-    view = camera.resized(*resolution.of(width, height)).view(background)
-    return Photograph(row.name, view, row.image, camera, row.lens, row.mask)
+    seen = camera.resized(*resolution.of(width, height))
+    if centred:
+        seen = replace(seen, cx=seen.width / 2, cy=seen.height / 2)
+    return Photograph(row.name, seen.view(background), row.image, camera, row.lens, row.mask)
 
 
 def _expect_aspect(

@@ -80,18 +80,13 @@ def trained_on(model: Path) -> Photographs | None:
     """
     if (known := _arguments(model)) is None:
         return None
-    warn_of_seen(model)
-    return known[0]
-
-
-def warn_of_seen(model: Path) -> None:
-    """Warn if the training of a model held no view out."""
-    if saw_all(model):
+    if not known[1]:
         log.warning(
             "%s was trained without --eval: it has seen the held-out views, so figures on them "
             "flatter it",
             printable(str(output_folder(model))),
         )
+    return known[0]
 
 
 def saw_all(model: Path) -> bool:
@@ -120,6 +115,7 @@ def _arguments(model: Path) -> tuple[Photographs, bool] | None:
             Resolution.asked(int(values.get("resolution", -1)), _DIVISORS),
             bool(values.get("white_background", False)),
             str(values.get("images", "images")),
+            centred=True,
         )
     return photographs, bool(values.get("eval", False))
 
@@ -130,6 +126,19 @@ def over_white(model: Path) -> bool:
         known = _arguments(model)
         return known is not None and known[0].white_background
     return False
+
+
+def drawn_as_trained(folder: Path, *models: Path) -> Photographs:
+    """A folder's photographs, over the background and around the middle that models' trainings had.
+
+    These are known by the arguments in the models' output folders.
+    """
+    known = []
+    for model in models:
+        with contextlib.suppress(DatasetError):
+            known.append(trained_on(model))
+    white = any(each.white_background for each in known if each)
+    return Photographs(folder, white_background=white, centred=any(known))
 
 
 def _call(text: str) -> ast.Call:

@@ -49,6 +49,11 @@ class Camera:
         check_lens(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
         check_pose(self.rotation, self.translation)
 
+    @property
+    def off_centre(self) -> float:
+        """How far the principal point is from the middle in x or y, pixels."""
+        return max(abs(self.cx - self.width / 2), abs(self.cy - self.height / 2))
+
     def resized(self, width: int, height: int) -> Camera:
         """The same camera with another number of pixels."""
         x, y = width / self.width, height / self.height

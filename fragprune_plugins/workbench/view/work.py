@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import webbrowser
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,14 @@ import torch
 from fragprune_plugins.errors import OutputError
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.reading import lies_in
+from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.figures.viewing import overview
 from fragprune_plugins.workbench.models.model import load, writable_folder
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
-from fragprune_plugins.workbench.scenes.dataset import load_dataset
-from fragprune_plugins.workbench.scenes.output import cameras_of, output_folder
+from fragprune_plugins.workbench.scenes.dataset import load_photographs
+from fragprune_plugins.workbench.scenes.output import cameras_of, drawn_as_trained, output_folder
 from fragprune_plugins.workbench.view.site import (
     Layer,
     Shown,
@@ -55,7 +57,8 @@ def view(
     if truncated == [True, False]:  # the original stands left of the split
         for each in (paths, models, truncated):
             each.reverse()
-    shown = _cameras(data, cameras or cameras_of(model), white_background)
+    read = None if data is None else drawn_as_trained(data, *paths)
+    shown = _cameras(read, cameras or cameras_of(model), white_background)
     if shown:
         start = shown[0].view
     else:
@@ -125,10 +128,11 @@ def _told_apart(left: Path, right: Path) -> tuple[str, str]:
     return str(left), str(right)
 
 
-def _cameras(data: Path | None, cameras: Path | None, white_background: bool) -> list[Shown]:
+def _cameras(data: Photographs | None, cameras: Path | None, white_background: bool) -> list[Shown]:
     """The cameras of the page's list: held-out ones of a scene, or all of a file."""
     if data is not None:
-        shots = load_dataset(data, white_background=white_background).test
+        white = white_background or data.white_background
+        shots = load_photographs(replace(data, white_background=white)).test
         return [Shown(shot.name, shot.view, shot) for shot in shots]
     if cameras is not None:
         named = load_cameras(cameras, white_background=white_background)
