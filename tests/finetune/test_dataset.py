@@ -125,6 +125,13 @@ LENS = '{"camera_model": "EQUIRECTANGULAR", '
             lambda f: (f / IMAGES).write_text((f / IMAGES).read_text().replace("\n\n", "\n")),
             "images.txt.* at line 3 .*10 words where an image's 2D points belong",
         ),
+        (  # the sub-folders were flattened, and one camera's photographs are there
+            tiny.write_colmap,
+            lambda f: (f / IMAGES).write_text(
+                (f / IMAGES).read_text().replace("view04", "a/view02").replace("view02", "b/view02")
+            ),
+            "view02.png: the photograph of 2 views",
+        ),
     ],
 )
 def test_bad_scenes_are_refused_by_name(tmp_path, images, write, break_it, words):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import weakref
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -260,6 +261,12 @@ def load_dataset(
     background = torch.full((3,), float(white_background))
     size = resolution if isinstance(resolution, Resolution) else Resolution(divide=resolution)
     rows = read_scene(Path(folder), images)
+    for part in rows:
+        (path, views), *_ = Counter(row.image for row in part).most_common(1)
+        if views > 1:
+            found, expected = f"the photograph of {views} views", "a photograph for each view"
+            remedy = "Keep the sub-folders that the scene names below its folder of images."
+            raise DatasetError(str(path), found, expected, remedy)
     train, test = ([make_shot(row, background, size, centred) for row in part] for part in rows)
     dataset = Dataset(train, test)
     off = max(
