@@ -28,6 +28,17 @@ def test_letters_that_a_stream_cannot_write_become_escapes(tmp_path):
     assert (tmp_path / "\u2192" / MODULE.name).exists()
 
 
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")
+@pytest.mark.parametrize("words", [["--help"], ["adapters"], ["adapters", "--json"]])
+def test_a_stream_without_space_is_stated(words):
+    with open("/dev/full", "w") as full:
+        words = [sys.executable, "-m", "fragprune_plugins", *words]
+        done = subprocess.run(words, stdout=full, stderr=subprocess.PIPE, timeout=100)
+    assert done.returncode == 1
+    assert done.stderr.startswith(b"[path] stdout: no space left")
+    assert b"Traceback" not in done.stderr
+
+
 def test_a_folder_that_is_gone_is_stated(tmp_path):
     here = tmp_path / "here"
     here.mkdir()

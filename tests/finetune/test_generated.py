@@ -1,5 +1,6 @@
 """Cameras around a splat and between given ones."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -9,8 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from fragprune_plugins import rasterize
 from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.types import View
+from fragprune_plugins.workbench.render.filming import orbit
 from fragprune_plugins.workbench.scenes.generated import (
     around,
     beside,
@@ -153,6 +156,16 @@ def test_cameras_around_look_at_the_centre_from_all_sides_and_not_from_within():
     for view in views:
         middle = torch.cat([centre, torch.ones(1)]) @ view.projmatrix
         torch.testing.assert_close(middle[:2] / middle[3], torch.zeros(2), atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("scale", [0.002, 0.05, 1.0, 50.0])
+def test_a_splat_fills_its_pictures_whatever_its_unit(scale):
+    splat = tiny.random_model(count=100)
+    small = replace(splat, xyz=splat.xyz * scale, scaling=splat.scaling + math.log(scale))
+    for cameras in (around(small, 6, pixels=64), orbit(small, 4, (0, -1, 0))):
+        for _, view in cameras:
+            outputs = rasterize(small, view)
+            assert (outputs.radii > 0).float().mean() > 0.8
 
 
 def test_one_in_eight_is_held_out():

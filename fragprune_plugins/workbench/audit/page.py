@@ -65,10 +65,11 @@ def draw(folder: Path, shown: Sequence[Shown]) -> dict[str, Any]:
 def sentence(figures: Mapping[str, Any]) -> str:
     """One line to quote."""
     idle, views = figures["idle"], "view" if figures["views"] == 1 else "views"
+    drawers = "Gaussian draws" if figures["gaussians"] == 1 else "Gaussians draw"
     cameras = _FROM[figures["cameras"]["kind"]].format(views)
     quads = figures["viewers"][0]["shaded_per_pixel"]
     return (
-        f"{figures['gaussians']:,} Gaussians draw {figures['fragments_per_pixel']:.1f} fragments "
+        f"{figures['gaussians']:,} {drawers} {figures['fragments_per_pixel']:.1f} fragments "
         f"per pixel, {figures['frame_ms']:.1f} ms a frame of {figures['frame_size']} pixels on our "
         f"{figures['engine']} engine; a "
         f"viewer of fixed √8 sigma quads shades {quads:.1f} pixels per pixel. "

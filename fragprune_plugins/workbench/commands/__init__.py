@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import sys
@@ -9,7 +10,7 @@ from typing import NoReturn
 
 import click
 
-from fragprune_plugins.errors import PluginError
+from fragprune_plugins.errors import PathError, PluginError
 from fragprune_plugins.plugins.points import load, offered
 from fragprune_plugins.workbench.commands.command import Command, Group
 
@@ -91,4 +92,12 @@ def main() -> None:
     # By default, OpenMP's threads spin while they wait. On a busy machine, torch on two threads was
     # fifty times slower with spinning threads than with sleeping ones.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    cli(prog_name="fragprune")
+    try:
+        cli(prog_name="fragprune")
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT) or error.filename:
+            raise
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is left goes there at the end
+        full = PathError("stdout", "no space left there", "a stream that takes it", "Free space.")
+        click.echo(str(full), err=True)
+        sys.exit(1)

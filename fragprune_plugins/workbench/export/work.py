@@ -49,7 +49,7 @@ def export(
     held += f" in the column {column}" if column else ""
     held += "" if splat.rim == "hard" else f" and a {splat.rim} rim"
     held += "" if splat.stop is None else f" and a stop at {splat.stop:g}"
-    held = f": {len(splat)} Gaussians with {held}"
+    held = f": {len(splat)} Gaussian{'' if len(splat) == 1 else 's'} with {held}"
     lines.append(describe_written(out, held, pruned=splat.pruned))
     data = {
         "model": str(model),

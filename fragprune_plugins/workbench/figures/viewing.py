@@ -19,7 +19,7 @@ from fragprune_plugins.plugins.hooks import engine_for, thresholds_for
 from fragprune_plugins.types import RasterInputs, RasterOutputs, View
 from fragprune_plugins.workbench.figures.pictures import picture
 from fragprune_plugins.workbench.models import model as models
-from fragprune_plugins.workbench.scenes.generated import bounds
+from fragprune_plugins.workbench.scenes.generated import bounds, not_too_near
 from fragprune_plugins.workbench.scenes.pinhole import look_at
 
 if TYPE_CHECKING:
@@ -45,7 +45,8 @@ def overview(
         up: (3,) what is up in its world; COLMAP's worlds have y down.
         width: pixels.
         height: pixels.
-        fov_y: vertical field of view, degrees.
+        fov_y: vertical field of view, degrees; less for a splat of 0.15 units or less, of which
+            hosts would leave out what is nearer than 0.2.
 
     Raises:
         InputError: there is no such view.
@@ -57,7 +58,7 @@ def overview(
     ahead = torch.eye(3)[2 if abs(float(above[2])) < 0.9 else 1]
     ahead = torch.nn.functional.normalize(ahead - above * (ahead @ above), dim=0)
     away = torch.nn.functional.normalize(0.4 * above - ahead, dim=0)
-    distance = radius / math.sin(half)
+    distance, fov_y = not_too_near(radius / math.sin(half), radius, fov_y)
     eye = centre + distance * away
     return look_at(eye, centre, up, width=width, height=height, fov_y=fov_y)
 

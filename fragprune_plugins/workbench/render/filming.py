@@ -34,13 +34,14 @@ def orbit(splat: Model, count: int, up: tuple[float, float, float]) -> Named:
     """
     first = overview(splat, up, **_PICTURE)
     centre, _ = bounds(splat)
+    shape = _PICTURE | {"fov_y": math.degrees(2 * math.atan(first.tan_fov_y))}
     axis = torch.nn.functional.normalize(torch.tensor(up, dtype=torch.float64), dim=0)
     away = first.campos.double() - centre.double()
     views = []
     for number in range(count):
         turn = Rotation.from_rotvec((2 * math.pi * number / count * axis).numpy())
         eye = centre.double() + torch.from_numpy(turn.apply(away.numpy()))
-        view = look_at(eye.float(), centre, up, **_PICTURE)
+        view = look_at(eye.float(), centre, up, **shape)
         views.append((f"orbit{number:04d}", view))
     return views
 

@@ -18,6 +18,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from fragprune_plugins.constants import NEAR
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.files.model import Model
@@ -41,7 +42,7 @@ _FOV, _WIDE = 50.0, 75.0  # degrees; rooms are looked at with wide lenses
 _LEVEL = 0.5  # sine of the steepest look from inside: 30 degrees
 _NEIGHBOURS = 4
 _BETWEEN = (0.1, 0.9)  # of the way; nearer to a camera is its own picture again
-_NEAR = 5  # cameras beside each photograph's
+_ASIDE = 5  # cameras beside each photograph's
 _BESIDE = (-0.6, 0.6)  # of the way; visitors leave the path of the photographs on both sides
 
 
@@ -58,6 +59,17 @@ def bounds(splat: Model) -> tuple[Tensor, float]:
     return centre, max(radius, 1e-3)
 
 
+def not_too_near(distance: float, radius: float, fov: float) -> tuple[float, float]:
+    """A distance and a field of view, degrees, at which a splat of this radius is drawn whole.
+
+    Nothing nearer than ``NEAR`` is drawn: of a splat that is small in its world a part would be
+    missing, or all. From farther away a narrower lens shows it at the same size.
+    """
+    farther = max(distance, radius + NEAR)
+    half = math.atan(math.tan(math.radians(fov) / 2) * distance / farther)
+    return farther, math.degrees(2 * half)
+
+
 def around(
     splat: Model,
     count: int = ORBIT_VIEWS,
@@ -68,7 +80,8 @@ def around(
 ) -> Named:
     """Cameras all around a splat, evenly spread over a sphere; from below, too.
 
-    They look at its robust centre from where nine tenths of it fill the picture, or from nearer.
+    They look at its robust centre from where nine tenths of it fill the picture, or from nearer;
+    at a small splat from farther away, through a narrower lens.
 
     Args:
         pixels: of each side of their pictures.
@@ -80,8 +93,9 @@ def around(
     views = []
     for number in range(count):
         far = radius / math.sin(math.radians(_FOV) / 2) * stream.uniform(*_NEARER)
+        far, fov = not_too_near(far, radius, _FOV)
         eye = centre + far * _direction(number, count)
-        view = look_at(eye, centre, width=pixels, height=pixels, fov_y=_FOV, background=background)
+        view = look_at(eye, centre, width=pixels, height=pixels, fov_y=fov, background=background)
         views.append((f"around{number:03d}", view))
     return views
 
@@ -154,7 +168,7 @@ def views_near(shots: Sequence[Shot], *, seed: int = 0) -> list[View]:
         seed: of the cameras beside theirs; none if no two photographs look the same way.
     """
     named = [(shot.name, shot.view) for shot in shots]
-    return [view for _, view in (*named, *beside(named, _NEAR * len(named), seed=seed))]
+    return [view for _, view in (*named, *beside(named, _ASIDE * len(named), seed=seed))]
 
 
 def _neighbours(cameras: Named) -> list[list[int]]:
