@@ -1,12 +1,15 @@
 """Measuring splats on photographs, and the pictures of it."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from finetune import tiny
 from PIL import Image
 
 from fragprune_plugins import finetune, keep_best, keep_needed
-from fragprune_plugins.errors import InputError
+from fragprune_plugins.errors import EngineError, InputError
+from fragprune_plugins.plugins.hooks import engine_for
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure, measure_all
 from fragprune_plugins.workbench.figures.pictures import save_image, save_panel
 from fragprune_plugins.workbench.scenes.dataset import Dataset
@@ -64,6 +67,21 @@ def test_nothing_to_measure_learn_or_judge_by_is_stated(truth, shots):
     for keep in (lambda: keep_best(truth, 0.5, []), lambda: keep_needed(truth, [])):
         with pytest.raises(InputError, match="no view to judge by"):
             keep()
+
+
+class Smaller:
+    """An engine of a plugin that draws at another size than it was asked for."""
+
+    name = "smaller"
+
+    def rasterize(self, inputs, thresholds):
+        outputs = engine_for("reference").rasterize(inputs, thresholds)
+        return replace(outputs, image=outputs.image[:, ::2, ::2])
+
+
+def test_an_engine_that_draws_no_picture_of_the_view_is_named(truth, shots):
+    with pytest.raises(EngineError, match=r"engine smaller.*\(3, 16, 16\).*\(3, 32, 32\)"):
+        measure(truth, shots, engine=Smaller())
 
 
 def test_images_are_written_as_seen(tmp_path):

@@ -15,7 +15,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.errors import InputError
+from fragprune_plugins.errors import EngineError, InputError
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.area import SQUARED_RADIUS
 from fragprune_plugins.plugins.hooks import engine_for, thresholds_for
@@ -75,7 +75,13 @@ class Candidate:
     def draw(self, engine: Engine, view: View, *, counts: bool = False) -> RasterOutputs:
         """Draw one view, optionally with counts of fragments."""
         inputs = replace(self.inputs(view), counts=counts)
-        return engine.rasterize(inputs, self.thresholds(inputs))
+        outputs = engine.rasterize(inputs, self.thresholds(inputs))
+        size = tuple(getattr(getattr(outputs, "image", None), "shape", ()))
+        if size != (3, view.height, view.width):  # a plugin's engine may give anything
+            found = f"{type(outputs).__name__} with an image of shape {size}"
+            expected = f"RasterOutputs with (3, {view.height}, {view.width})"
+            raise EngineError(f"engine {engine.name}", found, expected, "Choose another --engine.")
+        return outputs
 
 
 def measure(

@@ -276,7 +276,7 @@ def begun(data: Mapping[str, Any]) -> list[str]:
             f"A trial made other photographs {data['forgotten']:.2f} dB worse, so the model knew "
             f"its photographs by heart, and learned with --dropout {dropout:g}."
         )
-    if keep is not None:
+    if keep not in (None, 1):
         why = "those whose removal changed the training views and views beside them least"
         if keep == "visible":
             why = "which reached no pixel of any view"

@@ -211,7 +211,7 @@ def _report(opened: _Opened, over: Finetuned, measured: dict[str, Any] | None) -
 
 def _keep(whole: Model, asked: Asked, dataset: Dataset, engine: Engine) -> Model:
     """The Gaussians that --keep leaves, for what training views and cameras beside them show."""
-    if asked.keep is None:
+    if asked.keep in (None, 1):
         return whole
     shots = dataset.train
     if asked.keep == "visible":
