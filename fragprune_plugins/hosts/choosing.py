@@ -88,13 +88,13 @@ def locate(
         if used and not name and any(each.held for each in attempt(repo, adapters)):
             raise  # a host of its own, that draws by that package
         packages = [package for each in used if (package := HostRepo.installed(each))]
-        for candidate in (*(above_of(repo) if above else ()), *packages):
+        for candidate in (*(folder_above(repo) if above else ()), *packages):
             with contextlib.suppress(UnknownHostError):
                 return candidate, choose(candidate, adapters, name, select)
         raise
 
 
-def above_of(repo: HostRepo) -> list[HostRepo]:
+def folder_above(repo: HostRepo) -> list[HostRepo]:
     """The folder above, which may hold all that its user has, if scripts import what lies in it."""
     above = HostRepo(repo.root.parent)
     used = {name for each in repo.root.glob("*.py") for name in imported(repo.tree(each.stem))}

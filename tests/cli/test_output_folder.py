@@ -74,8 +74,8 @@ def test_beside_data_the_training_says_whether_it_drew_over_white(data, model, t
 
 def test_render_takes_the_trainings_cameras(output, tmp_path):
     report = run_json("render", output, "--out", tmp_path / "pictures")
-    (file,) = report["files"]
-    with Image.open(file) as picture:
+    assert len(report["files"]) == 9
+    with Image.open(report["files"][0]) as picture:
         assert picture.size == (tiny.SIDE, tiny.SIDE)
 
 
@@ -122,21 +122,33 @@ def test_views_that_a_training_saw_are_not_said_to_be_held_out(data, model, tmp_
 def listed(output):
     """Writes the cameras.json of a training that held these views out."""
 
-    def write(held, at=0.0):
-        rows = tiny.host_cameras(tiny.cameras())
+    def write(held, at=0.0, of=9):
+        rows = tiny.host_cameras(tiny.cameras())[:of]
         for row in rows:
             row["position"][0] += at
-        rows.sort(key=lambda row: row["id"] not in held)
+        first = [row for row in rows if row["id"] in held]
+        twice = len(held) > len({*held})
+        rows = first + [row for row in rows if twice or row["id"] not in held]
         (output / "cameras.json").write_text(json.dumps(rows))
         return output
 
     return write
 
 
-@pytest.mark.parametrize(("held", "seen"), [((0, 8), False), ((3, 4), True), ((0,), True)])
-def test_a_training_that_held_other_views_out_has_seen_ours(listed, tmp_path, held, seen):
+@pytest.mark.parametrize(
+    ("held", "of", "seen"),
+    [
+        *(((0, 8), 9, False), ((3, 4), 9, True), ((0,), 9, True)),
+        ((0, 0, 8), 9, True),  # held out, and learned from
+        ((0,), 4, True),  # a part of the photographs
+    ],
+)
+def test_a_training_that_held_other_views_out_has_seen_ours(
+    listed, tmp_path, caplog, held, of, seen
+):
     words = ("--out", tmp_path / "r.ply", "--iters", 2, "--train", "opacity")
-    assert run_json("finetune", listed(held), *words)["seen"] is seen
+    assert run_json("finetune", listed(held, of=of), *words)["seen"] is seen
+    assert ("held out other views, of" in caplog.text) is seen
 
 
 @pytest.mark.parametrize(("at", "said"), [(0.0, False), (1e-5, False), (0.5, True)])

@@ -8,12 +8,15 @@ import subprocess
 import sys
 
 import pytest
-from cli.commands import fails, run
+from cli.commands import fails, run, run_json
 from core.test_verdict import fork as fork  # a fixture
+from finetune import tiny
 from miniatures.runs import TINY
 from miniatures.vanilla_3dgs import HOST
 
 from fragprune_plugins.files.ply import read_ply
+from fragprune_plugins.hosts.photographs import Photographs, Resolution
+from fragprune_plugins.workbench.figures.records import beside, recorded
 
 TRAINING = """
 import os, shutil, sys
@@ -110,6 +113,44 @@ def test_a_model_with_exposures_learns_from_its_own_pictures(host, photographs, 
     assert json.loads(result.stdout)["target"] == "itself"
 
 
+def test_without_its_arguments_photographs_are_read_as_the_command_says(
+    host, photographs, tmp_path
+):
+    words = host(photographs)
+    script = words[2]
+    script.write_text(script.read_text().replace("/cfg_args", "/other_args"))
+    result = run("run", *WORDS, *words, "-r", 2, "-w")
+    assert result.exit_code == 0, result.stderr
+    record = beside(tmp_path / "out/point_cloud/iteration_9/pruned.ply")
+    read = recorded(record).photographs
+    how = {"white_background": True, "centred": True}
+    assert read == Photographs(photographs, Resolution(divide=2), **how)
+
+
+def test_a_script_in_a_folder_of_its_codebase_is_served(host, photographs, tmp_path):
+    words = host(photographs)
+    script = words[2]
+    below = script.parent / "gs/train.py"
+    below.parent.mkdir()
+    finds = f"import sys\nsys.path.append({str(script.parent)!r})\nfrom scene import __name__\n"
+    below.write_text(finds + script.read_text())
+    (script.parent / "scene/__init__.py").write_text("")
+    words[2] = below
+    result = run("run", *WORDS, *words)
+    assert result.exit_code == 0, result.stderr
+
+
+def test_its_record_and_page_are_of_run(host, photographs, tmp_path):
+    words, out = host(photographs), tmp_path / "out"
+    said = run("run", *WORDS, *words).stdout
+    assert f"fragprune report {out} " in said
+    assert beside(out / "point_cloud/iteration_9/pruned.ply").command == "run"
+    page = run_json("report", out)
+    assert page["command"] == "run"
+    assert "to see, add --stage finetune --control to the same command." in page["result"]
+    assert "was finished before" in run("run", *WORDS, "--stage", "finetune", *words).stdout
+
+
 def test_it_is_said_who_learned(host, photographs, caplog):
     caplog.set_level("INFO", logger="fragprune")
     result = run("run", *WORDS, *host(photographs))
@@ -138,6 +179,18 @@ def test_a_signal_ends_the_training_too(number, code, host, photographs):
         assert run_.wait(60) == code
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
+
+
+@pytest.mark.usefixtures("ctrl_c")
+def test_an_interrupted_second_stage_is_told_how_to_go_on(host, photographs, monkeypatch):
+    words = host(photographs)
+    with monkeypatch.context() as patch:
+        tiny.at_loss(patch, 3, lambda: signal.raise_signal(signal.SIGINT))
+        result = run("run", *WORDS, "--dropout", 0, *words)
+    assert result.exit_code == 130
+    assert "The same command with --stage finetune goes on from there." in result.stdout
+    more = ("--json", "--dropout", 0, "--stage", "finetune")
+    assert json.loads(run("run", *more, *WORDS, *words).stdout)["resumed_at"] == 3
 
 
 def hear_ctrl_c():

@@ -83,7 +83,7 @@ def test_the_original_that_a_record_names_stands_left_if_it_lies_in_the_same_fol
 
 def test_the_cameras_of_a_training_are_found(data, model, page):
     report, held = page(tiny.host_output(data.parent / "out", data, model))
-    assert report["cameras"] == 1
+    assert report["cameras"] == 9
     expected = tiny.host_cameras(tiny.cameras()[:1])[0]["position"]
     assert held["start"]["position"] == pytest.approx(expected)
 

@@ -13,9 +13,9 @@ from fragprune_plugins.errors import UnknownHostError
 from fragprune_plugins.hosts.adapter import HostAdapter, ScriptAdapter
 from fragprune_plugins.hosts.choosing import (
     Attempt,
-    above_of,
     attempt,
     closest,
+    folder_above,
     locate,
     usage,
 )
@@ -246,7 +246,7 @@ def _repository(host: Path, adapters: list[HostAdapter], name: str | None) -> Ho
 
 def _above(repo: HostRepo, adapters: list[HostAdapter]) -> str:
     """That the folder above fits, if scripts of this one use it; else ""."""
-    for above in above_of(repo):
+    for above in folder_above(repo):
         for fits in closest(attempt(above, adapters), adapters):
             return (
                 f"Its scripts use the folder above, which fits {fits.adapter.name}, as run finds: "

@@ -23,6 +23,7 @@ from fragprune_plugins.workbench.models import formats
 from fragprune_plugins.workbench.models.model import describe_written, load
 from fragprune_plugins.workbench.pruning import Keep
 from fragprune_plugins.workbench.scenes.dataset import Dataset
+from fragprune_plugins.workbench.scenes.output import output_folder
 
 LOST = 0.05
 """A loss of PSNR against the model as it came, in dB, from which on more is advised."""
@@ -32,7 +33,12 @@ _OF_RECORDS = {"cameras", "curves", "photographs", "configuration", "text"}
 
 @dataclass(frozen=True)
 class Asked:
-    """The options of the command, by their names there."""
+    """The options of the command, by their names there; more of a ``run`` that comes to this.
+
+    Attributes:
+        command: the one that the user gave.
+        photographs: those to learn from; None for those of the options.
+    """
 
     model: Path
     out: Path
@@ -46,6 +52,8 @@ class Asked:
     no_truncation: bool
     again: bool
     engine: EngineOptions
+    command: str = "finetune"
+    photographs: Photographs | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,8 +127,9 @@ class Finetuned:
         if photographs is not None:
             scene = photographs.folder
             more["photographs"] = records.Recorded(photographs, (asked.model, asked.out)).as_dict()
-        records.leave(asked.out, "finetune", data | more)
-        then = wording.next_steps(asked.out, asked.out.parent, scene)  # records name no folders
+        records.leave(asked.out, asked.command, data | more)
+        folder = output_folder(asked.out) or asked.out.parent
+        then = wording.next_steps(asked.out, folder, scene)  # records name no folders
         return Report(data, f"{text}\n{then}", exit_code=130 if result.interrupted else 0)
 
     def _data(self, figures: Mapping[str, dict[str, Any]], pictures: str) -> dict[str, Any]:
@@ -168,7 +177,7 @@ class Finetuned:
         lines = [
             wording.describe(wording.columns_of(data)),
             "",
-            wording.outcome("finetune", data, data["control"]),
+            wording.outcome(self.asked.command, data, data["control"]),
             f"{result.engine} engine, {data['iterations']} iterations{pressure} in "
             f"{result.train_seconds:.0f} s.",
         ]
@@ -183,7 +192,7 @@ class Finetuned:
             lines.append(wording.bounded(data))
         if result.interrupted:
             of = f"{data['iterations']} of {settings.iterations}"
-            lines.append(f"Interrupted at {of} iterations. {_goes_on(self.found)}")
+            lines.append(f"Interrupted at {of} iterations. {_goes_on(self.asked, self.found)}")
         lines += wording.begun(data)
         plain = data["untruncated"]
         if plain is not None:
@@ -205,7 +214,7 @@ def finished(model: Path, out: Path, asked: dict[str, Any]) -> Report | None:
         record = records.beside(out)
     except RecordError:
         return None
-    if record is None or record.command != "finetune" or record.data.get("configuration") != asked:
+    if record is None or record.data.get("configuration") != asked:
         return None
     written = Path(str(record.data.get("out"))).name
     if written != out.name:  # a model of the same name in another format
@@ -213,7 +222,7 @@ def finished(model: Path, out: Path, asked: dict[str, Any]) -> Report | None:
     data = {key: value for key, value in record.data.items() if key not in _OF_RECORDS}
     none, since = data.get("control"), records.control_of(data, records.files(out.parent))
     data["control"] = none or since
-    said, now = (wording.outcome("finetune", data, each) for each in (none, none or since))
+    said, now = (wording.outcome(record.command, data, each) for each in (none, none or since))
     text = (
         f"{record.data['text'].replace(said, now)}\n{out} was finished before: nothing was done. "
         "--again fine-tunes again."
@@ -222,12 +231,12 @@ def finished(model: Path, out: Path, asked: dict[str, Any]) -> Report | None:
     return Report(data | given | {"already_finished": True}, text)
 
 
-def terminated(model: Path, out: Path, result: FinetuneResult, found: Bounded | None) -> Report:
+def terminated(given: Asked, result: FinetuneResult, found: Bounded | None) -> Report:
     """The report after SIGTERM: the model is saved, and nothing is measured."""
     done, asked = result.progress, result.settings
     data = {
-        "model": str(model),
-        "out": str(out),
+        "model": str(given.model),
+        "out": str(given.out),
         "before": None,
         "after": None,
         "interrupted": True,
@@ -237,14 +246,15 @@ def terminated(model: Path, out: Path, result: FinetuneResult, found: Bounded | 
         "settings": asked.as_dict(),
     }
     at = f"SIGTERM at {done.steps} of {asked.iterations} iterations."
-    text = f"{at} Wrote {out}. {_goes_on(found)}"
+    text = f"{at} Wrote {given.out}. {_goes_on(given, found)}"
     return Report(data, text, exit_code=EXIT_CODE)
 
 
-def _goes_on(found: Bounded | None) -> str:
-    if found is None:
-        return "The same command goes on from there."
-    return "With --max-drop the same command begins anew."
+def _goes_on(asked: Asked, found: Bounded | None) -> str:
+    if found is not None:
+        return "With --max-drop the same command begins anew."
+    trained = " with --stage finetune" if asked.command == "run" else ""  # else it trains again
+    return f"The same command{trained} goes on from there."
 
 
 def advise(data: dict[str, Any]) -> str | None:

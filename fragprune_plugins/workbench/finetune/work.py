@@ -105,7 +105,7 @@ def _open(asked: Asked) -> _Opened:
     scene, settings, photographs = asked.scene, asked.settings, None
     if scene.data is not None or not asked.itself:
         remedy = "Pass --data FOLDER with photographs; without any, --self."
-        photographs = photographs_for(asked.model, scene, remedy=remedy)
+        photographs = asked.photographs or photographs_for(asked.model, scene, remedy=remedy)
         if not asked.itself and (name := exposed(asked.model)):
             raise UsageError(
                 "MODEL",
@@ -201,7 +201,7 @@ def _report(opened: _Opened, over: Finetuned, measured: dict[str, Any] | None) -
     """Say what came of it; before that, measure it."""
     asked, result = opened.asked, over.result
     if result.terminated:  # after SIGTERM there is no time for measurements
-        return finetuned.terminated(asked.model, asked.out, result, over.found)
+        return finetuned.terminated(asked, result, over.found)
     figures = measured or over.measured(opened.dataset, opened.engine)
     report = over.report(figures, opened.photographs, opened.configuration)
     if not result.interrupted:

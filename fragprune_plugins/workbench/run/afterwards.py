@@ -13,7 +13,8 @@ from pathlib import Path
 
 from fragprune_plugins.errors import HostFailed, UsageError
 from fragprune_plugins.hosts.adapter import Flags
-from fragprune_plugins.hosts.choosing import attempt
+from fragprune_plugins.hosts.choosing import attempt, folder_above
+from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.command import split
 from fragprune_plugins.learning.interruption import Terminate, sigterm_interrupts
@@ -21,11 +22,10 @@ from fragprune_plugins.learning.schedule import QUICK_ITERATIONS, Settings
 from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
-from fragprune_plugins.workbench.figures.wording import CONTROLLED_BY
 from fragprune_plugins.workbench.finetune.work import finetune
 from fragprune_plugins.workbench.saved import models_of
 from fragprune_plugins.workbench.scenes.dataset import read_scene
-from fragprune_plugins.workbench.scenes.output import cameras_of, trained_on
+from fragprune_plugins.workbench.scenes.output import DIVISORS, cameras_of, trained_on
 from fragprune_plugins.workbench.scenes.training import exposed
 
 log = logging.getLogger("fragprune")
@@ -40,7 +40,8 @@ class Unserved:
     Attributes:
         program: the words of the command that name what the interpreter runs.
         arguments: those after them.
-        flags: those that 3DGS has: output and source, None where not given, and images.
+        flags: those that 3DGS has: output and source, None where not given, and how it reads
+            photographs: images, resolution, white_background.
         why: what speaks against the nearest adapter.
         unlike: why its model's pictures may differ from the photographs; see ``Plain``.
     """
@@ -83,14 +84,24 @@ class Unserved:
             raise HostFailed(self.program[-1], what, "the model that it trained", _BY_HAND)
         return max(found, key=lambda each: each.stat().st_mtime)
 
+    def photographs(self) -> Photographs | None:
+        """Those that the command names, read as its flags say; None if it names none."""
+        flags = self.flags
+        if flags.source is None:
+            return None
+        size = Resolution.asked(int(flags.resolution), DIVISORS)
+        return Photographs(flags.source, size, flags.white_background, flags.images, centred=True)
+
 
 def unserved(command: Sequence[str]) -> Unserved | None:
     """The command, if it trains, no adapter fits its codebase, and that saves plain 3DGS."""
     script, arguments, module = split(list(command))
-    repo, plugins = HostRepo(script.parent), load_plugins()
-    trains = "train" in script.stem or ".backward(" in repo.read(script)
-    own = models_of(repo, plugins)[0]
-    if not trains or not own:
+    here, plugins = HostRepo(script.parent), load_plugins()
+    trains = "train" in script.stem or ".backward(" in here.read(script)
+    folders = [here, *folder_above(here)] if trains else []
+    found = ((each, models_of(each, plugins)[0]) for each in folders)
+    repo, own = next((pair for pair in found if pair[1]), (here, None))
+    if own is None:
         return None
     tried = attempt(repo, plugins.adapters)
     if any(each.match.fits for each in tried):
@@ -100,6 +111,8 @@ def unserved(command: Sequence[str]) -> Unserved | None:
     parser.add_argument("-m", "--model_path", dest="output", type=Path)
     parser.add_argument("-s", "--source_path", dest="source", type=Path)
     parser.add_argument("-i", "--images", default="images")
+    parser.add_argument("-r", "--resolution", type=float, default=-1)
+    parser.add_argument("-w", "--white_background", action="store_true")
     flags, _ = parser.parse_known_args(arguments)
     why = tried[0].brief() if tried else "none is installed"
     return Unserved(program, tuple(arguments), flags, why, own.unlike)
@@ -140,16 +153,17 @@ def train_then_finetune(
     if not host.unlike and (name := exposed(model)):
         settings = _settings_of(f"it learned an exposure for {name}", settings)
     out = model.with_name("pruned.ply" if settings.goal.presses else "control.ply")
-    data = None if (cameras_of if settings.itself else trained_on)(model) else source
-    more = " --self" * settings.itself + (f" --data {data}" if data else "")
-    log.info("its model learns by vanilla 3DGS's drawing and loss, as in")
-    log.info("  fragprune finetune %s%s --out %s", model, more, out)
+    photographs = trained_on(model) or host.photographs()
+    log.info("%s learns by vanilla 3DGS's drawing and loss, as in fragprune finetune", model)
+    if photographs is not None and not settings.itself:
+        log.info("from the photographs in %s", photographs.folder)
+    data = None if not settings.itself or cameras_of(model) else host.flags.source
     report = finetune(
         model=model,
         out=out,
         itself=settings.itself,
         cameras=None,
-        scene=SceneOptions(data=data),
+        scene=SceneOptions(data, white_background=host.flags.white_background),
         settings=settings,
         keep=None,
         seed=settings.seed,
@@ -157,11 +171,12 @@ def train_then_finetune(
         no_truncation=False,
         again=again,
         engine=engine,
+        command="run",
+        photographs=photographs,
     )
     assert report is not None
-    host_data = {"adapter": None, "stage": stage, "model_before": str(model)}
-    text = report.text.replace(CONTROLLED_BY["finetune"], CONTROLLED_BY["run"])
-    return replace(report, data=host_data | report.data, text=text)
+    host_data = {"stage": stage, "model_before": str(model), "model_after": str(out)}
+    return replace(report, data=report.data | host_data)
 
 
 def _settings_of(unlike: str, settings: Settings) -> Settings:

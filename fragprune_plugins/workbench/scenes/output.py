@@ -20,7 +20,7 @@ from fragprune_plugins.hosts.source import parsed
 
 ARGUMENTS, CAMERAS = "cfg_args", "cameras.json"
 
-_DIVISORS = (1, 2, 4, 8)  # of -r; other numbers are widths
+DIVISORS = (1, 2, 4, 8)  # of -r; other numbers are widths
 
 _FILE = UntrustedFile(
     DatasetError,
@@ -112,7 +112,7 @@ def _arguments(model: Path) -> tuple[Photographs, bool] | None:
         reading.place = ""
         photographs = Photographs(
             Path(str(values["source_path"])),
-            Resolution.asked(int(values.get("resolution", -1)), _DIVISORS),
+            Resolution.asked(int(values.get("resolution", -1)), DIVISORS),
             bool(values.get("white_background", False)),
             str(values.get("images", "images")),
             centred=True,

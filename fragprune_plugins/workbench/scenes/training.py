@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import contextlib
-from itertools import islice
+import logging
+from collections import Counter
 from pathlib import Path
 
 import torch
 
-from fragprune_plugins.errors import DatasetError
+from fragprune_plugins.errors import DatasetError, printable
 from fragprune_plugins.files.reading import UntrustedFile
 from fragprune_plugins.types import View
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
 from fragprune_plugins.workbench.scenes.dataset import Dataset
 from fragprune_plugins.workbench.scenes.output import cameras_of, output_folder, saw_all
 from fragprune_plugins.workbench.scenes.transforms import matrix
+
+log = logging.getLogger(__name__)
 
 _FAR = 0.01
 """Of the cameras' extent, or of a turn in radians: other worlds are further, files round less."""
@@ -30,13 +33,26 @@ _EXPOSURES = UntrustedFile(
 
 
 def saw_held_out(model: Path, dataset: Dataset) -> bool:
-    """Whether the training of a model is known to have seen some of the held-out photographs.
+    """Whether the training of a model saw views that are held out here, as far as it can be known.
 
-    Hosts list the views that they hold out first in ``cameras.json``.
+    They are training photographs too, or it held none out by its arguments; or its cameras.json, in
+    which hosts list first what they hold out, begins with others or has these among the others
+    too, which is warned of.
     """
-    listed, held = _listed(model), {Path(shot.name).stem for shot in dataset.test}
-    others = listed.keys() >= held and {*islice(listed, len(held))} != held
-    return dataset.leaked > 0 or saw_all(model) or others
+    if dataset.leaked or saw_all(model):
+        return True
+    listed = [name for name, _ in _listed(model)]
+    train, held = (Counter(_base(s.name) for s in each) for each in (dataset.train, dataset.test))
+    first, others = Counter(listed[: held.total()]), Counter(listed[held.total() :])
+    if not listed or (first == held and not (others - train) & held):
+        return False
+    log.warning(
+        "%s: the training held out other views, of %d in all. Here %d of %d are held out: it may "
+        "have seen them, so figures on them flatter it",
+        *(printable(str(cameras_of(model))), len(listed)),
+        *(held.total(), held.total() + train.total()),
+    )
+    return True
 
 
 def moved(model: Path, dataset: Dataset) -> str:
@@ -45,8 +61,9 @@ def moved(model: Path, dataset: Dataset) -> str:
     Its codebase may turn or scale the world, or move cameras, after it reads them.
     """
     listed, extent = _listed(model), dataset.extent
+    known = {} if len(dict(listed)) < len(listed) else dict(listed)  # as in Blender's layout
     for shot in (*dataset.train, *dataset.test):
-        was = listed.get(Path(shot.name).stem)
+        was = known.get(_base(shot.name))
         if was is not None:
             turned = (was.viewmatrix - shot.view.viewmatrix.cpu())[:3, :3].norm()
             far = (was.campos - shot.view.campos.cpu()).norm()
@@ -76,13 +93,15 @@ def exposed(model: Path) -> str:
     return ""
 
 
-def _listed(model: Path) -> dict[str, View]:
-    """The cameras of a training by the stems of their photographs, in its order.
-
-    None where two have one stem, as training and held-out views of Blender's layout.
-    """
-    path, cameras = cameras_of(model), list[tuple[str, View]]()
+def _listed(model: Path) -> list[tuple[str, View]]:
+    """The cameras of a training by the names of their photographs, in its order."""
+    path = cameras_of(model)
     with contextlib.suppress(DatasetError):
         cameras = load_cameras(path) if path else []
-    stems = {Path(name).stem: view for name, view in cameras}
-    return stems if len(stems) == len(cameras) else {}
+        return [(_base(name), view) for name, view in cameras]
+    return []
+
+
+def _base(name: str) -> str:
+    """The name of a view as every host has it: without folders, up to its first dot."""
+    return name.rpartition("/")[2].partition(".")[0]
