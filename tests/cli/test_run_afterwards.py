@@ -127,6 +127,18 @@ def test_without_its_arguments_photographs_are_read_as_the_command_says(
     assert read == Photographs(photographs, Resolution(divide=2), **how)
 
 
+def test_what_a_host_makes_of_its_model_in_a_folder_below_is_not_taken(host, photographs, tmp_path):
+    """Self-Organizing-Gaussians compresses it, and writes what comes out again."""
+    words, below = host(photographs), "/coded/name/point_cloud/iteration_1"
+    script = words[2]
+    copied = f"out + '/point_cloud/iteration_9', out + {below!r}, copy_function=shutil.copy"
+    text = script.read_text().replace("\nprint(", f"\nshutil.copytree({copied})\nprint(")
+    script.write_text(text)
+    data = json.loads(run("run", "--json", *WORDS, *words).stdout)
+    assert (tmp_path / f"out{below}/point_cloud.ply").exists()
+    assert data["model_before"] == str(tmp_path / "out/point_cloud/iteration_9/point_cloud.ply")
+
+
 def test_a_script_in_a_folder_of_its_codebase_is_served(host, photographs, tmp_path):
     words = host(photographs)
     script = words[2]

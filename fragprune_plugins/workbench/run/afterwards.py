@@ -72,7 +72,7 @@ class Unserved:
             raise HostFailed(self.program[-1], f"exit code {code}", "a training to its end", remedy)
 
     def saved(self, since: float) -> Path:
-        """The PLY that it wrote last, since a time.
+        """The PLY that it wrote last, since a time; what it makes of one lies in folders below it.
 
         Raises:
             HostFailed: there is none.
@@ -82,7 +82,7 @@ class Unserved:
         if not found:
             what = f"no point_cloud.ply in {folder}" + (" since it began" if since else "")
             raise HostFailed(self.program[-1], what, "the model that it trained", _BY_HAND)
-        return max(found, key=lambda each: each.stat().st_mtime)
+        return max(found, key=lambda each: (-len(each.parts), each.stat().st_mtime))
 
     def photographs(self) -> Photographs | None:
         """Those that the command names, read as its flags say; None if it names none."""
