@@ -148,7 +148,8 @@ def train_then_finetune(
         log.info("it trains as it is, by itself")
         host.train(quietly=json)
     elif host.flags.output is None:
-        raise UsageError("command", "no -m", "the output folder of the training", "Add -m FOLDER.")
+        remedy = "Add -m FOLDER, also if the training knows no -m: it is not started again."
+        raise UsageError("command", "no -m", "the output folder of the training", remedy)
     model = host.saved(since)
     if not host.unlike and (name := exposed(model)):
         settings = _settings_of(f"it learned an exposure for {name}", settings)
