@@ -5,7 +5,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from cli.commands import run, run_json
+from cli.commands import fails, run, run_json
 from miniatures.skeletons import skeleton
 
 from fragprune_plugins.adapting import HostRepo, Role, Seam
@@ -179,6 +179,11 @@ def test_a_folder_that_is_no_host(tmp_path):
     assert "adapters knows anything of it" in text
     assert "python -m pydoc fragprune_plugins.adapting" in text  # an installed package has no docs/
     assert "docs/" not in text
+
+
+def test_what_a_training_wrote_is_not_judged_as_a_host(tmp_path):
+    (tmp_path / "cfg_args").touch()
+    fails("check", tmp_path, says=("the output folder of a training", "fragprune audit"), code=1)
 
 
 def test_a_folder_whose_scripts_use_the_one_above_names_it(host):

@@ -26,7 +26,9 @@ from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import proofs
 from fragprune_plugins.plugins.loading import Plugins, load_plugins
 from fragprune_plugins.workbench.commands.command import Report
+from fragprune_plugins.workbench.figures.wording import quoted
 from fragprune_plugins.workbench.saved import models_of
+from fragprune_plugins.workbench.scenes.output import ARGUMENTS
 
 
 def check(*, hosts: tuple[Path, ...], adapter: str | None) -> Report:
@@ -38,6 +40,13 @@ def check(*, hosts: tuple[Path, ...], adapter: str | None) -> Report:
                 "neither a folder nor an installed package",
                 "a host's checkout, or the import name of an installed host",
                 "Name the folder of train.py.",
+            )
+        if (host / ARGUMENTS).is_file():
+            raise UnknownHostError(
+                str(host),
+                "the output folder of a training",
+                "a host's checkout",
+                f"Name the folder of train.py. For the model: fragprune audit {quoted(host)}",
             )
     plugins = load_plugins()
     adapters = plugins.adapters

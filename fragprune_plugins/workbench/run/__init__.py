@@ -66,6 +66,7 @@ def command(**options: Any) -> Report:
 
     If no adapter fits the codebase, but the PLY that it saves is plain 3DGS (fragprune check
     tells), its training runs by itself, and that PLY is then fine-tuned as by fragprune finetune.
+    Where that was interrupted, --stage finetune goes on; without it the training runs again.
 
     \b
     Examples:
