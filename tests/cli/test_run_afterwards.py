@@ -236,6 +236,29 @@ def test_photographs_that_we_cannot_read_are_said_before_the_training(host, tmp_
     assert not (tmp_path / "out").exists()
 
 
+def test_a_training_may_choose_its_folder_below_the_working_one(
+    host, photographs, tmp_path, monkeypatch
+):
+    words = host(photographs)
+    script = words[2]
+    monkeypatch.chdir(tmp_path)
+    script.write_text(
+        script.read_text().replace("= sys.argv[2], sys.argv[4]", "= sys.argv[2], 'o'")
+    )
+    data = json.loads(run("run", "--json", *WORDS, *words).stdout)
+    assert data["model_before"] == str(tmp_path / "o/point_cloud/iteration_9/point_cloud.ply")
+
+
+def test_a_script_that_trains_another_model_than_was_read_is_not_trained(
+    host, photographs, tmp_path
+):
+    words = host(photographs)
+    text = words[2].read_text()
+    words[2].write_text(f"{text}\nfrom scene.flat import FlatGaussianModel\n")
+    fails("run", *WORDS, *words, says="no adapter fits", code=1)
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_fork_whose_ply_is_not_plain_is_not_trained(fork, photographs, tmp_path):
     root = fork(("return self._xyz", "return self._xyz + self.moved")).root
     command = ["--", root / "train.py", "-s", photographs, "-m", tmp_path / "out"]

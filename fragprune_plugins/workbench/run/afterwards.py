@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import subprocess
 import sys
 import time
@@ -30,6 +31,7 @@ from fragprune_plugins.workbench.scenes.training import exposed
 
 log = logging.getLogger("fragprune")
 
+_SAVED = "point_cloud.ply"
 _BY_HAND = "fragprune finetune MODEL.ply --data SCENE --out pruned.ply learns on any that is there."
 
 
@@ -74,15 +76,18 @@ class Unserved:
     def saved(self, since: float) -> Path:
         """The PLY that it wrote last, since a time; what it makes of one lies in folders below it.
 
+        A training that chooses its folder by itself is expected to do so below the working one.
+
         Raises:
             HostFailed: there is none.
         """
         folder: Path = self.flags.output or Path.cwd()
-        found = [each for each in folder.rglob("point_cloud.ply") if each.stat().st_mtime >= since]
-        if not found:
-            what = f"no point_cloud.ply in {folder}" + (" since it began" if since else "")
-            raise HostFailed(self.program[-1], what, "the model that it trained", _BY_HAND)
-        return max(found, key=lambda each: (-len(each.parts), each.stat().st_mtime))
+        for place in (folder, Path.cwd()) if since else (folder,):
+            found = [each for each in place.rglob(_SAVED) if each.stat().st_mtime >= since]
+            if found:
+                return max(found, key=lambda each: (-len(each.parts), each.stat().st_mtime))
+        what = f"no {_SAVED} in {folder}" + (" since it began" if since else "")
+        raise HostFailed(self.program[-1], what, "the model that it trained", _BY_HAND)
 
     def photographs(self) -> Photographs | None:
         """Those that the command names, read as its flags say; None if it names none."""
@@ -101,7 +106,8 @@ def unserved(command: Sequence[str]) -> Unserved | None:
     folders = [here, *folder_above(here)] if trains else []
     found = ((each, models_of(each, plugins)[0]) for each in folders)
     repo, own = next((pair for pair in found if pair[1]), (here, None))
-    if own is None:
+    models = set(re.findall(r"\b\w*GaussianModel\w*", here.read(script)))
+    if own is None or (models and own.model not in models):  # another may save other columns
         return None
     tried = attempt(repo, plugins.adapters)
     if any(each.match.fits for each in tried):
