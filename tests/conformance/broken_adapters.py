@@ -143,11 +143,12 @@ class FitsEverything(Vanilla3DGS):
 
 @dataclass(frozen=True)
 class Glowing(GraphdecoDialect):
-    """Every Gaussian lights up the whole picture, drawn or not."""
+    """Every Gaussian lights up all that is drawn, drawn or not."""
 
     def pack(self, outputs: Any, call: Any) -> Any:
         image, *rest = super().pack(outputs, call)
-        return image + call["opacities"].mean(), *rest
+        drawn = image - call.settings.bg[:, None, None]
+        return image + call["opacities"].mean() * drawn, *rest
 
 
 class LeavesATrace(Vanilla3DGS):
@@ -165,6 +166,37 @@ class Wavering(GraphdecoDialect):
     def unpack(self, call: Any) -> Any:
         self.calls[0] += 1
         return replace(super().unpack(call), dilation=0.3 + 0.05 * self.calls[0])
+
+
+@dataclass(frozen=True)
+class Black(GraphdecoDialect):
+    """Draws over black, whatever was asked for."""
+
+    def unpack(self, call: Any) -> Any:
+        inputs = super().unpack(call)
+        return replace(inputs, view=replace(inputs.view, background=torch.zeros(3)))
+
+
+class ForgetsTheBackground(Vanilla3DGS):
+    """Draws over black, whatever was asked for."""
+
+    def dialect(self, repo: Any) -> Black:
+        return Black(**vars(super().dialect(repo)))
+
+
+@dataclass(frozen=True)
+class Radiusless(GraphdecoDialect):
+    """Gives radii of 0."""
+
+    def pack(self, outputs: Any, call: Any) -> Any:
+        return super().pack(replace(outputs, radii=torch.zeros_like(outputs.radii)), call)
+
+
+class GivesNoRadii(Vanilla3DGS):
+    """Gives radii of 0."""
+
+    def dialect(self, repo: Any) -> Radiusless:
+        return Radiusless(**vars(super().dialect(repo)))
 
 
 class DrawsOtherwiseEachTime(Vanilla3DGS):

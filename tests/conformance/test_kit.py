@@ -35,6 +35,8 @@ def case(adapter, **options):
         (invariants.neutral_is_the_host, broken.TakesRandomNumbers, "differ from the host's own"),
         (invariants.alignment, broken.MixesUpParents, "descends from"),
         (invariants.monotone, broken.LeavesATrace, "not close"),
+        (invariants.monotone, broken.ForgetsTheBackground, "the background is off by 0.9"),
+        (invariants.monotone, broken.GivesNoRadii, "no Gaussian has a radius"),
         (invariants.checkpoint, broken.LosesTheCheckpoint, "of a restored model differ"),
         (invariants.checkpoint, broken.LeavesParametersAsleep, "resumed, ['f_dc', 'opacity',"),
         (invariants.checkpoint, broken.LeavesItsRates, "resumed, rates are"),

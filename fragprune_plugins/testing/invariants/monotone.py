@@ -35,7 +35,12 @@ def monotone(case: Case) -> None:
             )
             require((after.fragments <= before.fragments).all(), "a pixel has more fragments")
             require(torch.equal(seen, still_seen), "radii, by which hosts densify, changed")
+            require((seen > 0).any(), "no Gaussian has a radius, by which hosts densify")
             require(after.fragments.sum() < before.fragments.sum(), "nothing was truncated")
+            fixed.values, behind = torch.full((24,), 1 - 1e-6), torch.tensor([0.2, 0.5, 0.9])
+            empty = host.render(camera, model, behind)["render"].detach().cpu()
+            away = float((empty - behind[:, None, None]).abs().max())
+            require(away < 1e-6, f"nothing is drawn, and the background is off by {away:.2g}")
     _no_trace(case)
 
 
