@@ -486,13 +486,12 @@ class GraphdecoAdapter(ScriptAdapter):
                 "views that are held out",
                 f"Train with {line.hold_out[-1]}, from stage 1 on.",
             )
-        projection = repo.function("utils.graphics_utils", "getProjectionMatrix")
         return Photographs(
             Path(flags.source or ""),
             resolution(repo, flags.resolution),
             bool(flags.white_background),
             flags.images or "images",
-            centred=projection is None or "cx" not in text_of(projection),
+            centred=_centred(repo),
         )
 
     def not_drawn(self, repo: HostRepo, arguments: list[str]) -> list[str]:
@@ -538,6 +537,13 @@ class GraphdecoAdapter(ScriptAdapter):
             if number.isdigit()
         ]
         return [(iteration, path) for _, iteration, _, path in sorted(found)]
+
+
+def _centred(repo: HostRepo) -> bool:
+    """Whether cameras get their projection of two planes and two angles, around the middle."""
+    usual, calls = "getProjectionMatrix", every(repo.tree("scene.cameras"), ast.Call)
+    made = [each for each in calls if text_of(each.func).startswith(usual)]
+    return all(text_of(c.func) == usual and len(c.args) + len(c.keywords) == 4 for c in made)
 
 
 def group_names(function: Function | None) -> tuple[str, ...]:

@@ -9,9 +9,12 @@ from cli.commands import fails, run, run_json
 from finetune import tiny
 from PIL import Image
 
+import fragprune_plugins as fp
+from fragprune_plugins import RasterInputs
 from fragprune_plugins.errors import DatasetError, ModelFileError
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.workbench.models.formats.ply import write_ply
+from fragprune_plugins.workbench.scenes.dataset import load_dataset
 from fragprune_plugins.workbench.scenes.output import newest_model, trained_on
 
 
@@ -57,6 +60,25 @@ def test_pictures_are_drawn_as_the_training_did_around_the_middle(output, data, 
     psnr = run_json("profile", pruned, "--data", data)["psnr"]  # of "middle"
     (data / "sparse" / "0" / "cameras.txt").write_text(f"{lens} 20 16\n")
     assert run_json("profile", pruned, "--data", data)["psnr"] == psnr
+
+
+@pytest.mark.parametrize("middle", [True, False])
+def test_a_model_is_fine_tuned_around_the_point_by_which_it_shows_its_photographs(
+    data, model, path, tmp_path, middle
+):
+    """Where it lies says what hosts usually do; the photographs know better."""
+    lens = f"7 PINHOLE {tiny.SIDE} {tiny.SIDE} 36 36 20 16\n"
+    (data / "sparse" / "0" / "cameras.txt").write_text(lens)
+    words = ("finetune", path, "--data", data)
+    if not middle:
+        scene = load_dataset(data)
+        for shot in (*scene.train, *scene.test):
+            drawn = fp.rasterize(RasterInputs(shot.view, model.splats()))
+            tiny.save_png(shot.path, drawn.image.detach())
+        words = ("finetune", tiny.host_output(tmp_path / "out", data, model))
+    said = run(*words, "--out", tmp_path / "r.ply", "--iters", 2).stderr
+    where = "the middle" if middle else "the scene's principal point"
+    assert f"MODEL is drawn around {where}" in said
 
 
 @pytest.mark.parametrize("white", [True, False])

@@ -86,9 +86,11 @@ def test_folder_background_and_images_are_the_commands():
 def test_the_middle_is_the_principal_point_of_a_host_that_reads_no_other(tmp_path):
     assert command().centred
     shutil.copytree(HOST.root, tmp_path, dirs_exist_ok=True)
-    source = tmp_path / "utils" / "graphics_utils.py"
-    with source.open("a") as file:
-        file.write("def getProjectionMatrix(znear, zfar, fovX, fovY, cx=None):\n    P[3, 2] = 1\n")
+    source = tmp_path / "scene" / "cameras.py"
+    usual = "projection = getProjectionMatrix(znear, zfar, fovX, fovY"
+    source.write_text(f"{usual})\n")
+    assert Vanilla3DGS().photographs(HostRepo(tmp_path), ["-s", "scene", "--eval"]).centred
+    source.write_text(f"{usual}, cx=cx)\n")
     assert not Vanilla3DGS().photographs(HostRepo(tmp_path), ["-s", "scene", "--eval"]).centred
 
 

@@ -39,7 +39,13 @@ from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.models.model import require_place
 from fragprune_plugins.workbench.pruning import kept
 from fragprune_plugins.workbench.ranks import Ranks, joined, launched
-from fragprune_plugins.workbench.scenes.dataset import Dataset, load_photographs
+from fragprune_plugins.workbench.scenes.dataset import (
+    OFF_CENTRE,
+    Dataset,
+    Photograph,
+    Shot,
+    load_photographs,
+)
 from fragprune_plugins.workbench.scenes.generated import views_near
 from fragprune_plugins.workbench.scenes.output import CAMERAS
 from fragprune_plugins.workbench.scenes.training import exposed, moved, saw_held_out
@@ -125,10 +131,34 @@ def _open(asked: Asked) -> _Opened:
     else:
         assert photographs is not None
         dataset = load_photographs(photographs)
+        if not asked.shard and any(_off_centre(shot) for shot in dataset.train):
+            photographs, dataset = _aimed(whole, photographs, engine)
     checkpoints = Checkpoints(resuming.path_beside(asked.out), resuming.EVERY, tell=_say)
     configuration = resuming.configuration(whole, dataset, settings, engine.name)
     configuration |= {"keep": asked.keep} | ({"sharded": True} if asked.shard else {})
     return _Opened(asked, whole, photographs, dataset, engine, device, checkpoints, configuration)
+
+
+def _off_centre(shot: Shot) -> bool:
+    camera = shot.camera if isinstance(shot, Photograph) else None
+    return camera is not None and camera.off_centre > OFF_CENTRE
+
+
+def _aimed(model: Model, read: Photographs, engine: Engine) -> tuple[Photographs, Dataset]:
+    """Photographs around the middle, or the scene's own principal point: as the model shows them.
+
+    3DGS and most of its descendants take the middle, whatever the scene says; others do not.
+    """
+    ways = [replace(read, centred=centred) for centred in (True, False)]
+    datasets = [load_photographs(each).to(model.device) for each in ways]
+    shown = [
+        statistics.fmean(psnrs(Candidate(model), evenly_spaced(each.train, 8), engine)[0])
+        for each in datasets
+    ]
+    best = shown.index(max(shown))
+    where = ("the middle", "the scene's principal point")[best]
+    _say(f"MODEL is drawn around {where}: {shown[best]:.1f} dB, {shown[1 - best]:.1f} otherwise.")
+    return ways[best], datasets[best]
 
 
 def _finished(opened: _Opened) -> Report | None:

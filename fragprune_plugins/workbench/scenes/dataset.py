@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from fragprune_plugins.workbench.scenes.lenses import Pixels
 
 _ASPECT_TOLERANCE = 0.01
-_OFF_CENTRE = 0.5  # pixels
+OFF_CENTRE = 0.5  # pixels
 _ROWS = 256  # of a picture, composited at a time
 _SEEN = 128  # grey levels of a mask, from which on the photograph is looked at
 _SMALLER = ("images_2", "images_4", "images_8")
@@ -272,11 +272,11 @@ def load_dataset(
     off = max(
         (row.camera.off_centre for part in rows for row in part if row.lens is None), default=0
     )
-    if off > _OFF_CENTRE and not centred and not transforms.has_transforms(Path(folder)):
+    if off > OFF_CENTRE and not centred and not transforms.has_transforms(Path(folder)):
         log.warning(
-            "%s: the principal point is up to %.1f pixels off the middle. 3DGS and most of its "
-            "descendants ignore that: pass a model of theirs in its output folder, with cfg_args, "
-            "or its figures are wrong",
+            "%s: the principal point is up to %.1f pixels off the middle, which 3DGS and most of "
+            "its descendants ignore: figures of their models are wrong, unless these lie in their "
+            "output folder, with cfg_args, or finetune made them",
             *(printable(str(folder)), off),
         )
     if dataset.leaked:
