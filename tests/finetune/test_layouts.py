@@ -172,6 +172,22 @@ def test_the_path_that_nerfstudios_viewer_saves(tmp_path):
     torch.testing.assert_close(view.projmatrix, want.view().projmatrix)
 
 
+def test_a_path_of_cameras_that_are_no_pinholes_is_refused(tmp_path):
+    path = tmp_path / "camera_path.json"
+    content = {"camera_type": "equirectangular", "render_width": 9, "render_height": 9}
+    path.write_text(json.dumps(content | {"camera_path": []}))
+    with pytest.raises(DatasetError, match="a path of 'equirectangular' cameras"):
+        load_cameras(path)
+
+
+def test_the_angle_of_the_height_is_read(tmp_path, images):
+    """As instant-ngp writes it, where pixels are not square."""
+    write_nerfstudio(tmp_path, images, camera_angle_y=1.0)
+    view = load_dataset(tmp_path).train[0].view
+    assert view.tan_fov_y == pytest.approx(math.tan(0.5))
+    assert view.tan_fov_x == pytest.approx(tiny.SIDE / (2 * tiny.FOCAL))
+
+
 def test_pictures_are_kept_only_while_there_is_room():
     loads: list[int] = []
 

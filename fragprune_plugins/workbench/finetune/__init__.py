@@ -107,7 +107,7 @@ def command(**options: Any) -> Report | None:
 
     Cutoffs and all other parameters adapt to each other on the photographs in --data. With
     --train opacity, positions, shapes and colours stay bit for bit. OUT has the columns of
-    MODEL, and one more for the cutoffs, trunc_threshold. The table compares both models on
+    3DGS, and one more for the cutoffs, trunc_threshold. The table compares both models on
     held-out views. A line below it measures OUT without its cutoffs, as other viewers draw it.
     Ctrl-C (exit code 130) and SIGTERM (143) save what was learned so far.
 

@@ -47,6 +47,8 @@ def load_cameras(path: str | Path, *, white_background: bool = False) -> list[tu
     content = load_json(path)
     if isinstance(content, dict) and "camera_path" in content:
         with _CAMERAS.stated(path) as reading:
+            if (kind := content.get("camera_type", "perspective")) != "perspective":
+                raise ValueError(f"a path of {str(kind)[:40]!r} cameras, where we draw perspective")
             size = int(content["render_width"]), int(content["render_height"])
             cameras = []
             for number, entry in enumerate(content["camera_path"]):

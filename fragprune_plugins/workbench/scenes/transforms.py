@@ -84,8 +84,9 @@ def read_transforms(path: Path, images: str = "images") -> list[Posed]:
     """Read the views of one transforms file.
 
     Every number may stand in a frame or in the file. Intrinsics are ``fl_x, fl_y, cx, cy`` where
-    given, else ``camera_angle_x`` and a centred principal point; ``w, h`` where given, else the
-    size of the image. Poses are taken as they stand: an ``applied_transform`` has been applied.
+    given, else ``camera_angle_x``, ``camera_angle_y`` and a centred principal point; ``w, h`` where
+    given, else the size of the image. Poses are taken as they stand: an ``applied_transform`` has
+    been applied.
     """
     content = load_json(path)
     with _TRANSFORMS.stated(path) as reading:
@@ -138,7 +139,11 @@ def _row(folder: Path, frame: dict[str, Any], images: str) -> Posed:
         fx = float(frame["fl_x"])
     else:
         fx = width / (2 * math.tan(float(frame["camera_angle_x"]) / 2))
-    usual = {"fl_y": fx, "cx": width / 2, "cy": height / 2}
+    if "camera_angle_y" in frame:
+        fy = height / (2 * math.tan(float(frame["camera_angle_y"]) / 2))
+    else:
+        fy = fx
+    usual = {"fl_y": fy, "cx": width / 2, "cy": height / 2}
     fy, cx, cy = (float(frame.get(name, number)) for name, number in usual.items())
     fisheye, coefficients = _distortion(frame)
     lens = Lens(width, height, fx, fy, cx, cy, coefficients, fisheye)
