@@ -141,11 +141,14 @@ def test_colmaps_lens_models(tmp_path, model, numbers, fy, coefficients):
     assert_straight(load_dataset(tmp_path).train[0], of)
 
 
-def test_nerfstudios_file_straightens_with_each_frames_own_lens(tmp_path):
+@pytest.mark.parametrize("named", [True, False])
+def test_nerfstudios_file_straightens_with_each_frames_own_lens(tmp_path, named):
     of = lens("opencv")
     write_photographs(tmp_path / "images", of)
     k1, k2, p1, p2 = of.coefficients[:4]
-    bent_frame = {"k1": k1, "k2": k2, "p1": p1, "p2": p2}
+    bent_frame = {"distortion_params": [k1, k2, 0, 0, p1, p2]}
+    if named:
+        bent_frame = {"k1": k1, "k2": k2, "p1": p1, "p2": p2}
     poses = {"transform_matrix": torch.eye(4).tolist()}
     frames = [{"file_path": f"images/view{i}.png"} | poses for i in range(9)]
     frames[1] |= bent_frame

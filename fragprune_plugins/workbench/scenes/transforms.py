@@ -167,6 +167,9 @@ def _distortion(frame: dict[str, Any]) -> tuple[bool, tuple[float, ...]]:
             f"one of {', '.join((*_PINHOLES[1:], *_BENT, *_FISHEYES))}",
             "Undistort the images first (colmap image_undistorter).",
         )
+    if "distortion_params" in frame:  # nerfstudio's, which go before the names
+        names = ("k1", "k2", "k3", "k4", "p1", "p2")
+        frame = frame | dict(zip(names, frame["distortion_params"], strict=True))
     k1, k2, p1, p2, k3, k4, k5, k6 = (
         float(frame.get(key, 0)) for key in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
     )
