@@ -353,7 +353,7 @@ def judge(
                 "then that follows)"
             )
         if plain.unlike:
-            sentence += f". It is not to learn from photographs: {plain.unlike}"
+            sentence += f". Photographs are left out: {plain.unlike}"
         return Verdict("finetune", sentence, plain.unlike, name, differs, inside)
     if inside:
         sentence = " ".join(
