@@ -34,7 +34,6 @@ from fragprune_graphdeco import (
     GraphdecoAdapter,
     GraphdecoDialect,
     kernels,
-    photographs,
     plain,
     reading,
 )
@@ -457,14 +456,10 @@ class ForkAdapter(GraphdecoAdapter):
             )
 
     def not_drawn(self, repo: HostRepo, arguments: list[str]) -> list[str]:
-        """Also what makes a picture beside the PLY: a network that moves or colours Gaussians, or a
-        script that compares another picture with the photographs.
-        """
+        """Also what makes a picture beside the PLY: a network that moves or colours Gaussians."""
         by = [f"--{name}" for name in read_fork(repo).colours if f"--{name}" in arguments]
         why = [*by, *sorted(plain.read_plain(repo).moved)]
         beside = [f"a PLY is not all that it draws: {each}" for each in why]
-        other = photographs.unlike(repo, map(reading.module_of, read_fork(repo).scripts))
-        beside += [other] * (other not in ("", photographs.NOT_FOUND))
         return beside + super().not_drawn(repo, arguments)
 
     def densified(self, repo: HostRepo, script: Path, arguments: list[str]) -> int | None:

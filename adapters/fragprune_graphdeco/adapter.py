@@ -12,7 +12,7 @@ from pathlib import Path
 from types import MappingProxyType, ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from fragprune_graphdeco import plain, reading
+from fragprune_graphdeco import photographs, plain, reading
 from fragprune_graphdeco.call import RasterizerCall, drawing_functions, read_calls
 from fragprune_graphdeco.densifying import clones, splits
 from fragprune_graphdeco.kernels import SPLAT, Kernel, read_kernels, vendored
@@ -495,11 +495,13 @@ class GraphdecoAdapter(ScriptAdapter):
         )
 
     def not_drawn(self, repo: HostRepo, arguments: list[str]) -> list[str]:
-        """What of a command our readers would draw otherwise."""
+        """What of a command our readers would draw otherwise, or compare with photographs."""
         flags = (flag for flag in self.undrawn_flags if flag in arguments)
         projection = repo.function("utils.graphics_utils", "getProjectionMatrix")
         pinhole = projection is None or "[3, 2]" in text_of(projection)
         other = [] if pinhole else ["its getProjectionMatrix, which is no pinhole camera's"]
+        why = photographs.unlike(repo, map(reading.module_of, self.scripts_of(repo)))
+        other += [why] * (why not in ("", photographs.NOT_FOUND))
         return [f"{flag}, which our readers do not support" for flag in flags] + other
 
     def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 
 from fragprune_graphdeco import reading
 from fragprune_graphdeco.reading import assigned, every, text_of
@@ -29,18 +29,31 @@ _KEEPS = {
 
 
 def unlike(repo: HostRepo, scripts: Iterable[str]) -> str:
-    """Why a model's pictures may differ from the photographs; "" if its scripts compare the two."""
-    why = NOT_FOUND
-    for script, tree in reading.reached(repo, scripts).items():
-        for function in every(tree, ast.FunctionDef):
-            for node, sides in _compared(function) if _learns(function) else ():
-                kinds = [_kinds(function, each) for each in sides]
+    """Why a model's pictures may differ from the photographs; "" if all scripts compare the two.
+
+    What scripts do only under options that are off by default does not count.
+    """
+    found = [why for each in scripts for why in _of_script(repo, each)]
+    said = sorted(filter(None, found), key=NOT_FOUND.__eq__)  # what was found comes first
+    return (said or found or [NOT_FOUND])[0]
+
+
+def _of_script(repo: HostRepo, script: str) -> Iterator[str]:
+    """``unlike`` of a script and what it imports; nothing if none of that learns."""
+    why, learns, known = NOT_FOUND, False, reading.as_options(repo, ("arguments", script))
+    for module, tree in reading.reached(repo, [script]).items():
+        for function in filter(_learns, every(tree, ast.FunctionDef)):
+            learns, gone = True, reading.skipped(function, known)
+            for node, sides in _compared(function):
+                kinds = [_kinds(function, each, gone) for each in sides]
+                if node in gone:
+                    continue
                 if sorted(map(sorted, kinds)) == [["drawn"], ["photograph"]]:
                     why = ""
                 elif {"drawn", "photograph"} <= set.union(*kinds):
                     texts = " with ".join(text_of(each)[:40] for each in sides)
-                    return f"its training compares {texts} ({repo.at(script, node.lineno)})"
-    return why
+                    yield f"its training compares {texts} ({repo.at(module, node.lineno)})"
+    yield from [why] * learns
 
 
 def _learns(function: Function) -> bool:
@@ -58,8 +71,12 @@ def _compared(function: Function) -> Iterator[tuple[ast.expr, list[ast.expr]]]:
             yield node, [node.left, node.right]
 
 
-def _kinds(function: Function, value: ast.expr) -> set[str]:
-    """What a value is made of: "drawn", "photograph", and the code of all else."""
+def _kinds(function: Function, value: ast.expr, gone: Collection[ast.AST]) -> set[str]:
+    """What a value is made of: "drawn", "photograph", and the code of all else.
+
+    Args:
+        gone: what the function does not do by its options.
+    """
     kinds, seen, waiting = set[str](), set[str](), [value]
     for node in waiting:  # it grows
         text = text_of(node)
@@ -70,7 +87,7 @@ def _kinds(function: Function, value: ast.expr) -> set[str]:
         elif getattr(getattr(node, "slice", None), "value", "") == "render":
             kinds.add("drawn")
         elif parts := _parts(function, node):
-            waiting += parts
+            waiting += [each for each in parts if each not in gone]
         else:
             kinds.add(text)
         seen.add(text)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from fragprune_graphdeco.photographs import unlike
+from fragprune_graphdeco.photographs import NOT_FOUND, unlike
 from fragprune_plugins.hosts.source import HostRepo
 
 SCRIPT = """
@@ -64,6 +64,24 @@ def test_another_picture_is_compared(tmp_path, written, compared):
     assert why(tmp_path, **written).startswith(f"its training compares {compared} (train.py:")
 
 
+@pytest.mark.parametrize(("default", "compared"), [("False", ""), ("True", "image with gt_image")])
+def test_what_an_option_switches_on_does_not_count_while_it_is_off(tmp_path, default, compared):
+    (tmp_path / "arguments").mkdir()
+    options = f"class Options:\n    def __init__(self):\n        self.water = {default}\n"
+    (tmp_path / "arguments/__init__.py").write_text(options)
+    found = why(tmp_path, between="if opt.water:\n    image = water(image) + image")
+    assert bool(found) == bool(compared)
+    assert compared in found
+
+
+def test_each_script_that_learns_is_to_compare_them(tmp_path):
+    assert why(tmp_path) == ""
+    (tmp_path / "train_viewer.py").write_text("def training(): show()\n")
+    assert unlike(HostRepo(tmp_path), ["train", "train_viewer"]) == ""
+    (tmp_path / "train_style.py").write_text("def training(): styled(image).backward()\n")
+    assert unlike(HostRepo(tmp_path), ["train", "train_style"]) == NOT_FOUND
+
+
 @pytest.mark.parametrize("loss", ["score_distillation(image)", "l1_loss(depth, seen_depth)"])
 def test_no_comparison_is_found(tmp_path, loss):
-    assert why(tmp_path, loss=loss) == "what its training compares with photographs was not found"
+    assert why(tmp_path, loss=loss) == NOT_FOUND
