@@ -42,12 +42,7 @@ class Clock:
 
 
 def colors(
-    sh: Tensor,
-    means: Tensor,
-    moved: Tensor,
-    campos: Tensor,
-    degree: int,
-    clock: Clock | None,
+    sh: Tensor, means: Tensor, moved: Tensor, campos: Tensor, degree: int, clock: Clock | None
 ) -> Tensor:
     """(N, 3) RGB, not below 0.
 

@@ -265,10 +265,7 @@ def cut(
 
 
 def draw(
-    footprints: Footprints,
-    thresholds: Tensor | None,
-    block: Block,
-    options: Options,
+    footprints: Footprints, thresholds: Tensor | None, block: Block, options: Options
 ) -> Drawing:
     """Blend a block's footprints, front to back, at each of its pixels.
 

@@ -30,13 +30,7 @@ from fragprune_3dgs_fork.fork import (
     rests_after_densification,
 )
 from fragprune_3dgs_fork.rasterizer import POSES, Output
-from fragprune_graphdeco import (
-    GraphdecoAdapter,
-    GraphdecoDialect,
-    kernels,
-    plain,
-    reading,
-)
+from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, kernels, plain, reading
 from fragprune_plugins.adapting import (
     CommandLine,
     EngineError,

@@ -117,11 +117,7 @@ class MovingGaussians(GraphdecoAdapter):
         "the host's metrics.py measures the pictures.",
     )
     steps_by_rendering = True
-    flags = {
-        "config": PythonFile("--configs"),
-        "made": ".fragprune_fine_{}.pth",
-        "hold_out": (),
-    }
+    flags = {"config": PythonFile("--configs"), "made": ".fragprune_fine_{}.pth", "hold_out": ()}
     checkpoints = "chkpnt_fine_"
     seams = (
         *revised(

@@ -13,14 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall, model_seam
-from fragprune_plugins.adapting import (
-    HostCall,
-    HostInfo,
-    HostRepo,
-    RasterOutputs,
-    Role,
-    Seam,
-)
+from fragprune_plugins.adapting import HostCall, HostInfo, HostRepo, RasterOutputs, Role, Seam
 
 TRAIN, PRUNE, DISTIL = "train_densify_prune.py", "prune_finetune.py", "distill_train.py"
 

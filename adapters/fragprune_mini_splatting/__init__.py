@@ -115,11 +115,7 @@ class MiniSplatting(GraphdecoAdapter):
         graphdeco.rasterizer_seam(SCORING),
         graphdeco.rasterizer_seam(SCORING, "render_depth"),
         model_seam(
-            Role.PARENTS,
-            "densify_and_split_mask",
-            *graphdeco.SPLIT.needs,
-            "mask",
-            how=masked,
+            Role.PARENTS, "densify_and_split_mask", *graphdeco.SPLIT.needs, "mask", how=masked
         ),
         model_seam(Role.STILL, "densify_and_prune_split"),
         model_seam(Role.STILL, "prune_points", "mask"),

@@ -13,13 +13,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from fragprune_plugins.adapting import (
-    InputError,
-    RasterInputs,
-    RasterOutputs,
-    Splats,
-    View,
-)
+from fragprune_plugins.adapting import InputError, RasterInputs, RasterOutputs, Splats, View
 
 if TYPE_CHECKING:
     from torch import Tensor

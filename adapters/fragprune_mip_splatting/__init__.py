@@ -16,14 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import fragprune_graphdeco as graphdeco
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall, model_seam
-from fragprune_plugins.adapting import (
-    HostCall,
-    HostInfo,
-    HostRepo,
-    RasterInputs,
-    Role,
-    revised,
-)
+from fragprune_plugins.adapting import HostCall, HostInfo, HostRepo, RasterInputs, Role, revised
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -16,7 +16,7 @@ LENGTH, MODEL = "--max-num-iterations", "--pipeline.model"
 LOADS = ("--load-dir", "--load-checkpoint")
 ELSEWHERE = {
     "splatfacto-big": f"splatfacto {MODEL}.cull-alpha-thresh 0.005 "
-    f"{MODEL}.densify-grad-thresh 0.0005",
+    f"{MODEL}.densify-grad-thresh 0.0005"
 }
 
 

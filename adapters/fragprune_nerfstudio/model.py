@@ -281,12 +281,7 @@ class FragpruneSplatfacto(SplatfactoModel):  # type: ignore[misc]
         state.stage.check()
         views = list(state.seen)
         tensors, plain = state.stage.state_dict(views)
-        return {
-            "begin": self.begin,
-            "views": views,
-            "tensors": tensors,
-            "plain": json.dumps(plain),
-        }
+        return {"begin": self.begin, "views": views, "tensors": tensors, "plain": json.dumps(plain)}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Keep what a checkpoint holds until its Gaussians are there."""

@@ -22,13 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fragprune_plugins.constants import (
-    ALPHA_MAX,
-    ALPHA_MIN,
-    DILATION,
-    TRANSMITTANCE_MIN,
-    VERSION,
-)
+from fragprune_plugins.constants import ALPHA_MAX, ALPHA_MIN, DILATION, TRANSMITTANCE_MIN, VERSION
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.workbench.models import cutoffs, formats
 from fragprune_plugins.workbench.models.formats.arrays import SH_C0, of_codes, splat_of

@@ -19,11 +19,7 @@ _workspace = cache(binding.Workspace)
 
 
 def compiled_loss(
-    image: Tensor,
-    target: Tensor,
-    *,
-    ssim_weight: float,
-    library: binding.Library | None = None,
+    image: Tensor, target: Tensor, *, ssim_weight: float, library: binding.Library | None = None
 ) -> Tensor:
     """(1 - ssim_weight) L1 + ssim_weight (1 - SSIM) of two images, by the compiled code.
 

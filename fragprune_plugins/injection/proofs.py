@@ -66,11 +66,7 @@ def proved(
 
 
 def _read_or_prove(
-    session: SessionState,
-    prover: Prover,
-    call: SeamCall,
-    drawn: HostCall,
-    shape: tuple[Any, ...],
+    session: SessionState, prover: Prover, call: SeamCall, drawn: HostCall, shape: tuple[Any, ...]
 ) -> Proof:
     """A kept proof of a call of this shape, else a new one, which is kept if it fails, too."""
     means = drawn[session.dialect.means]

@@ -176,10 +176,7 @@ class Host:
     def pipe(self) -> Any:
         """The pipeline options that hosts pass to ``render``."""
         return SimpleNamespace(
-            debug=False,
-            compute_cov3D_python=False,
-            convert_SHs_python=False,
-            antialiasing=False,
+            debug=False, compute_cov3D_python=False, convert_SHs_python=False, antialiasing=False
         )
 
     def render(self, camera: Any, model: Any, background: Tensor) -> dict[str, Any]:

@@ -5,12 +5,7 @@ import sys
 import pytest
 import torch
 from miniatures.mip_splatting import MipHost
-from miniatures.runs import (
-    OPTIONS,
-    check_measured,
-    command,
-    miniature,
-)
+from miniatures.runs import OPTIONS, check_measured, command, miniature
 from miniatures.vanilla_3dgs import joint, label, running
 
 from fragprune_mip_splatting import MipSplatting

@@ -45,10 +45,7 @@ def test_a_changed_host_is_refused_by_what_changed(adapter, file, old, new, foun
 
 @pytest.mark.parametrize(
     ("adapter", "script"),
-    [
-        ("light-gaussian", "distill_train.py"),
-        ("mini-splatting", "ms_d/train.py"),
-    ],
+    [("light-gaussian", "distill_train.py"), ("mini-splatting", "ms_d/train.py")],
 )
 def test_a_missing_script_is_named(adapter, script, tmp_path):
     (written(HOSTS[adapter], tmp_path) / script).unlink()
@@ -60,10 +57,7 @@ def test_a_missing_script_is_named(adapter, script, tmp_path):
 @pytest.mark.parametrize("gpu", [False, True])
 @pytest.mark.parametrize(
     ("adapter", "own", "answered"),
-    [
-        ("rain-gs", "submodules", "simple_knn"),
-        ("rt-4dgs", "gaussian_renderer", "pointops2_cuda"),
-    ],
+    [("rain-gs", "submodules", "simple_knn"), ("rt-4dgs", "gaussian_renderer", "pointops2_cuda")],
 )
 def test_a_rasterizer_of_its_own_stays_where_it_can_be_compiled(
     adapter, own, answered, tmp_path, monkeypatch, compiler, gpu

@@ -6,17 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser.chromium import opened, served
-from browser.compared import (
-    COUNT,
-    EDGE,
-    HALF_PIXELS,
-    a_model,
-    a_view,
-    falloffs,
-    firm,
-    ours,
-    psnr,
-)
+from browser.compared import COUNT, EDGE, HALF_PIXELS, a_model, a_view, falloffs, firm, ours, psnr
 from browser.engines import NoEnginesError, drawing, engines, install
 from cli.commands import run
 

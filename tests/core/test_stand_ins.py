@@ -8,10 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fragprune_graphdeco import stand_ins
-from fragprune_graphdeco.stand_ins import (
-    compute_relocation,
-    mean_squared_neighbour_distance,
-)
+from fragprune_graphdeco.stand_ins import compute_relocation, mean_squared_neighbour_distance
 
 coordinates = st.tuples(*[st.integers(-20, 20).map(lambda i: i / 4)] * 3)
 

@@ -311,8 +311,7 @@ class CompactHost(Descendant):
                 "                gaussians.scheduler_net.step()\n",
             ),
             adding(
-                "        args.debug_from,\n",
-                after="        args.comp,\n        args.store_npz,\n",
+                "        args.debug_from,\n", after="        args.comp,\n        args.store_npz,\n"
             ),
         ],
     }

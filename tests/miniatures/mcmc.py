@@ -6,16 +6,7 @@ from types import SimpleNamespace
 import torch
 
 from fragprune_plugins.testing.host import Chance, prune
-from miniatures.family import (
-    ANEW,
-    BACKWARD,
-    MODEL,
-    NEW_ROWS,
-    PARSE,
-    TRAIN,
-    Descendant,
-    adding,
-)
+from miniatures.family import ANEW, BACKWARD, MODEL, NEW_ROWS, PARSE, TRAIN, Descendant, adding
 
 args = SimpleNamespace()  # the host's training loop reads its own script's global of this name
 
@@ -140,15 +131,13 @@ class MCMCHost(Descendant):
         ],
         TRAIN: [
             adding(
-                "    first_iter = 0\n",
-                before="    if dataset.cap_max == -1:\n        sys.exit()\n",
+                "    first_iter = 0\n", before="    if dataset.cap_max == -1:\n        sys.exit()\n"
             ),
             ("        gaussians.update_learning", "        xyz_lr = gaussians.update_learning"),
             adding(BACKWARD, before="        loss = loss + regularisers(gaussians)\n"),
             ("                densify(iteration", "                move_in(iteration"),
             adding(
-                "zero_grad(set_to_none=True)\n",
-                after="                wander(gaussians, xyz_lr)\n",
+                "zero_grad(set_to_none=True)\n", after="                wander(gaussians, xyz_lr)\n"
             ),
             adding(
                 PARSE,

@@ -367,10 +367,7 @@ class RT4DGSHost(Descendant):
         "Pipeline": {"env_map_res": 0, "eval_shfs_4d": False},
         "Optimization": {"sh_increase_interval": 1000, "lambda_opa_mask": 0.0},
     }
-    cuts = {
-        RENDERER: ("    shape = {", "    return {", SLICED),
-        TRAIN: (PARSE, "", MAIN),
-    }
+    cuts = {RENDERER: ("    shape = {", "    return {", SLICED), TRAIN: (PARSE, "", MAIN)}
     changes = {
         RENDERER: RENDERING,
         MODEL: [adding("\n\nclass GaussianModel:\n", before=f"\n\nATTRIBUTES = {ATTRIBUTES}\n")],

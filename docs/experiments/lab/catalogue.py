@@ -10,14 +10,7 @@ from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.goals import Control, Portable, Pressure
 from fragprune_plugins.learning.pressure import LEAST_PRESSURE
 from fragprune_plugins.learning.schedule import Settings, Train
-from lab.rules import (
-    Rule,
-    Start,
-    alpha_cutoff,
-    falloff_threshold,
-    shrunk,
-    without_faint,
-)
+from lab.rules import Rule, Start, alpha_cutoff, falloff_threshold, shrunk, without_faint
 
 _FALLOFFS = (0.03, 0.07, 0.12, 0.2)
 _ALPHA_LEVELS = (4, 8, 12, 16)

@@ -180,11 +180,7 @@ _views_options = bundled(
     "--repeats", type=click.IntRange(min=2), default=15, show_default=True, help="Timed rounds."
 )
 def _time_stages(
-    models: tuple[Path, ...],
-    scene: SceneOptions,
-    out: Path,
-    engine: EngineOptions,
-    repeats: int,
+    models: tuple[Path, ...], scene: SceneOptions, out: Path, engine: EngineOptions, repeats: int
 ) -> Report:
     """Time the stages of frames on held-out views, from 256 pixels to 4K.
 
@@ -209,10 +205,7 @@ def _time_stages(
 @command.command("fragments", cls=Command, short_help=QUESTIONS["fragments"])
 @_views_options
 def _count_fragments(
-    models: tuple[Path, ...],
-    scene: SceneOptions,
-    out: Path,
-    engine: EngineOptions,
+    models: tuple[Path, ...], scene: SceneOptions, out: Path, engine: EngineOptions
 ) -> Report:
     """Count fragments by Gaussian, opacity, size and weight on held-out views.
 

@@ -27,11 +27,7 @@ RESULTS = (".md", ".csv", ".png")
 """Endings of the files that results are written to, after the experiment's name."""
 
 _FILE = UntrustedFile(
-    RecordError,
-    "unreadable",
-    "a file that an experiment wrote",
-    "Remove it.",
-    limit=64 * MEBIBYTE,
+    RecordError, "unreadable", "a file that an experiment wrote", "Remove it.", limit=64 * MEBIBYTE
 )
 
 _ARMS = "arms"

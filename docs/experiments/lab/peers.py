@@ -157,7 +157,7 @@ def _gausscam(given: Arrays) -> Drawing:
 
 
 PEERS: dict[str, tuple[tuple[str, ...], Callable[[Arrays], Drawing]]] = {
-    "gausscam": (("gausscam", "wgpu"), _gausscam),
+    "gausscam": (("gausscam", "wgpu"), _gausscam)
 }
 """By name: the modules it needs, and how it draws."""
 
@@ -173,10 +173,7 @@ def _child(name: str, inputs: str, outputs: str, repeats: int) -> None:
         frame = drawing.draw()
         times.append(1e3 * (time.perf_counter() - started))
     np.savez(
-        outputs,
-        image=drawing.image(frame),
-        times=np.array(times),
-        device=np.array(drawing.device),
+        outputs, image=drawing.image(frame), times=np.array(times), device=np.array(drawing.device)
     )
 
 

@@ -138,7 +138,7 @@ def table(report: dict[str, Any]) -> str:
     lines = [
         f"Chromium {report['chromium']}, {report['renderer']}; {SIZE[0]}x{SIZE[1]}; "
         f"load {report['load'][0]:.1f} before and {report['load'][1]:.1f} after, "
-        f"{report['machine']['cores']} cores. Median (least) of rounds in turns.",
+        f"{report['machine']['cores']} cores. Median (least) of rounds in turns."
     ]
     for name, scene in report["scenes"].items():
         lines += [

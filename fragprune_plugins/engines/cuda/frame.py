@@ -100,11 +100,7 @@ MACROS: Final = {
 
 
 def blend_macros(
-    features: int = 0,
-    *,
-    counts: bool = False,
-    scores: bool = False,
-    stop: bool = False,
+    features: int = 0, *, counts: bool = False, scores: bool = False, stop: bool = False
 ) -> dict[str, int]:
     """The macros with which native/cuda/blend.cu is compiled."""
     return {
@@ -298,10 +294,7 @@ class Drawing:
         )
         self._list(frame, *arenas)
         macros = blend_macros(
-            self._channels,
-            counts=inputs.counts,
-            scores=inputs.scores,
-            stop=inputs.stop is not None,
+            self._channels, counts=inputs.counts, scores=inputs.scores, stop=inputs.stop is not None
         )
         self._launch("blend", macros, "fp_blend", tiles, frame)
         found = cleared.tensor("counters", 4, torch.int64)

@@ -56,11 +56,7 @@ def audit(
     figures: dict[str, Any] = {
         "model": str(model),
         "data": None if data is None else str(data),
-        "cameras": {
-            "kind": placed.side,
-            "why": placed.why,
-            "enclosed": placed.enclosed,
-        },
+        "cameras": {"kind": placed.side, "why": placed.why, "enclosed": placed.enclosed},
         **measurements,
         "maps": None if out is None else page.draw(out, shown),
     }

@@ -7,11 +7,7 @@ from typing import Any
 import click
 
 from fragprune_plugins.workbench.commands.command import Command, Report, work_of
-from fragprune_plugins.workbench.commands.options import (
-    FILE,
-    MODEL,
-    engine_options,
-)
+from fragprune_plugins.workbench.commands.options import FILE, MODEL, engine_options
 from fragprune_plugins.workbench.commands.rules import Alone, Needs
 
 

@@ -11,14 +11,7 @@ from typing import Any, Literal
 
 from fragprune_plugins.errors import UnknownHostError
 from fragprune_plugins.hosts.adapter import HostAdapter, ScriptAdapter
-from fragprune_plugins.hosts.choosing import (
-    Attempt,
-    attempt,
-    closest,
-    folder_above,
-    locate,
-    usage,
-)
+from fragprune_plugins.hosts.choosing import Attempt, attempt, closest, folder_above, locate, usage
 from fragprune_plugins.hosts.dialect import Dialect, Proof
 from fragprune_plugins.hosts.findings import Finding, Plain
 from fragprune_plugins.hosts.preflight import Missing, install, missing_imports
@@ -313,10 +306,7 @@ class Verdict:
 
 
 def judge(
-    repo: HostRepo,
-    tried: Sequence[Attempt],
-    adapters: Sequence[HostAdapter],
-    plugins: Plugins,
+    repo: HostRepo, tried: Sequence[Attempt], adapters: Sequence[HostAdapter], plugins: Plugins
 ) -> Verdict:
     """Judge a checkout.
 

@@ -102,9 +102,7 @@ _OPTIONS = (
         "finetune, and run before stage 2, try whether the model is such a one.",
     ),
     click.option(
-        "--control",
-        is_flag=True,
-        help="Run the same iterations without pruning, to compare with.",
+        "--control", is_flag=True, help="Run the same iterations without pruning, to compare with."
     ),
 )
 

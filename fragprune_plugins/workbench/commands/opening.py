@@ -102,11 +102,9 @@ def overridden(photographs: Photographs, scene: SceneOptions) -> Photographs:
 
 def chosen(dataset: Dataset, views: str) -> Sequence[Shot]:
     """The views that ``--views`` names: "test", "train" or "all"."""
-    return {
-        "test": dataset.test,
-        "train": dataset.train,
-        "all": [*dataset.train, *dataset.test],
-    }[views]
+    return {"test": dataset.test, "train": dataset.train, "all": [*dataset.train, *dataset.test]}[
+        views
+    ]
 
 
 @dataclass(frozen=True)

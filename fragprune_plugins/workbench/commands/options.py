@@ -136,11 +136,7 @@ def engine_options(
     return bundled(
         gather,
         click.option(
-            "--engine",
-            metavar="NAME",
-            default="auto",
-            show_default=True,
-            help=f"{what}: {names}",
+            "--engine", metavar="NAME", default="auto", show_default=True, help=f"{what}: {names}"
         ),
         click.option(
             "--device",

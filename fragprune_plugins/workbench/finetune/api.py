@@ -89,13 +89,7 @@ def finetune(
             "Pass model.untruncated(), or --no-truncation on the command line.",
         )
     training = Training(
-        model,
-        dataset,
-        settings,
-        schedule or schedule_for(settings),
-        engine,
-        processes,
-        target,
+        model, dataset, settings, schedule or schedule_for(settings), engine, processes, target
     )
     return _learned(training, Keeper(checkpoints, training), progress and ranks.first)
 

@@ -28,11 +28,7 @@ JSON_MAX = 32 * MEBIBYTE
 """Ten thousand frames of nerfstudio take 11 to 13 MiB, of a ``cameras.json`` 4."""
 
 _JSON = UntrustedFile(
-    DatasetError,
-    "not readable as JSON",
-    "a JSON file of cameras",
-    "Save it again.",
-    limit=JSON_MAX,
+    DatasetError, "not readable as JSON", "a JSON file of cameras", "Save it again.", limit=JSON_MAX
 )
 _TRANSFORMS = UntrustedFile(
     DatasetError,

@@ -4,16 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lab.room.textures import (
-    Texture,
-    checker,
-    colour,
-    linear,
-    noise,
-    photograph,
-    planks,
-    stripes,
-)
+from lab.room.textures import Texture, checker, colour, linear, noise, photograph, planks, stripes
 from lab.room.tracer import Ball, Box, Material, Pole, Shape, World
 
 CENTRE = (-0.15, -0.15, 0.6)

@@ -12,11 +12,7 @@ import pytest
 
 PAGE = Path(__file__).parents[3] / "how-to" / "renderers.md"
 ROWS = re.findall(r"^\| (.+?), \S+ \| `(.+?)` \| (.+?) \|", PAGE.read_text("utf-8"), re.MULTILINE)
-FOLDERS = {
-    "gsplat": "gsplat",
-    "Faster-GS": "faster-gaussian-splatting",
-    "SuperSplat": "supersplat",
-}
+FOLDERS = {"gsplat": "gsplat", "Faster-GS": "faster-gaussian-splatting", "SuperSplat": "supersplat"}
 
 CUDA = """
 #include <algorithm>

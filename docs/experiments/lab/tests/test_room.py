@@ -5,13 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from lab.room.furniture import furnish
-from lab.room.photographs import (
-    SceneSettings,
-    make_scene,
-    photograph,
-    photos,
-    surface_points,
-)
+from lab.room.photographs import SceneSettings, make_scene, photograph, photos, surface_points
 from lab.room.textures import displayed
 
 from fragprune_plugins.workbench.scenes.dataset import load_dataset

@@ -50,9 +50,5 @@ if __name__ == "__main__":
     args = get_combined_args(parser)
     safe_state(0)
     render_sets(
-        model.extract(args),
-        args.iteration,
-        pipeline.extract(args),
-        args.skip_train,
-        args.skip_test,
+        model.extract(args), args.iteration, pipeline.extract(args), args.skip_train, args.skip_test
     )

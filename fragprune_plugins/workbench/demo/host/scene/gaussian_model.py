@@ -7,12 +7,7 @@ import torch
 from plyfile import PlyData, PlyElement
 from simple_knn._C import distCUDA2
 from torch import nn
-from utils.general_utils import (
-    build_covariance,
-    build_rotation,
-    get_expon_lr_func,
-    inverse_sigmoid,
-)
+from utils.general_utils import build_covariance, build_rotation, get_expon_lr_func, inverse_sigmoid
 from utils.sh_utils import RGB2SH
 
 
@@ -289,13 +284,7 @@ class GaussianModel:
         self.denom, self.max_radii2D = self.denom[keep], self.max_radii2D[keep]
 
     def densification_postfix(
-        self,
-        new_xyz,
-        new_features_dc,
-        new_features_rest,
-        new_opacities,
-        new_scaling,
-        new_rotation,
+        self, new_xyz, new_features_dc, new_features_rest, new_opacities, new_scaling, new_rotation
     ):
         """Append Gaussians and reset the statistics."""
         new = {
