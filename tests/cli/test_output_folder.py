@@ -64,7 +64,7 @@ def test_pictures_are_drawn_as_the_training_did_around_the_middle(output, data, 
 
 @pytest.mark.parametrize("middle", [True, False])
 def test_a_model_is_fine_tuned_around_the_point_by_which_it_shows_its_photographs(
-    data, model, path, tmp_path, middle
+    data, model, path, tmp_path, caplog, middle
 ):
     """Where it lies says what hosts usually do; the photographs know better."""
     lens = f"7 PINHOLE {tiny.SIDE} {tiny.SIDE} 36 36 20 16\n"
@@ -76,9 +76,18 @@ def test_a_model_is_fine_tuned_around_the_point_by_which_it_shows_its_photograph
             drawn = fp.rasterize(RasterInputs(shot.view, model.splats()))
             tiny.save_png(shot.path, drawn.image.detach())
         words = ("finetune", tiny.host_output(tmp_path / "out", data, model))
+        caplog.clear()
     said = run(*words, "--out", tmp_path / "r.ply", "--iters", 2).stderr
     where = "the middle" if middle else "the scene's principal point"
     assert f"MODEL is drawn around {where}" in said
+    assert "principal point" not in caplog.text  # it was asked for, so nothing is wrong
+
+
+def test_an_orbit_is_one_also_where_the_trainings_cameras_are_known(output):
+    for words in (("profile", output), ("compare", output, output)):
+        for option, views in (("--orbit", 12), ("--self", 2)):
+            report = run_json(*words, option)
+            assert report.get("b", report)["views"] == views
 
 
 @pytest.mark.parametrize("white", [True, False])

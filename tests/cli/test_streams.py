@@ -1,11 +1,14 @@
 """Commands in processes without streams, letters, or a folder to stand in."""
 
+import errno
 import os
 import subprocess
 import sys
+from unittest.mock import Mock
 
 import pytest
 
+from fragprune_plugins.workbench import commands
 from fragprune_spark import MODULE
 
 
@@ -37,6 +40,14 @@ def test_a_stream_without_space_is_stated(words):
     assert done.returncode == 1
     assert done.stderr.startswith(b"[path] stdout: no space left")
     assert b"Traceback" not in done.stderr
+
+
+def test_another_file_without_space_is_not_taken_for_the_stream(monkeypatch):
+    """A host's, for one: Python names no file where a write fails."""
+    full = OSError(errno.ENOSPC, "No space left on device")
+    monkeypatch.setattr(commands, "cli", Mock(side_effect=full))
+    with pytest.raises(OSError, match="No space left"):
+        commands.main()
 
 
 def test_a_folder_that_is_gone_is_stated(tmp_path):

@@ -6,6 +6,7 @@ import errno
 import io
 import os
 import sys
+import traceback
 from typing import NoReturn
 
 import click
@@ -95,7 +96,8 @@ def main() -> None:
     try:
         cli(prog_name="fragprune")
     except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT) or error.filename:
+        printing = traceback.extract_tb(error.__traceback__)[-1].name == click.echo.__name__
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT) or not printing:  # of another file
             raise
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is left goes there at the end
         full = PathError("stdout", "no space left there", "a stream that takes it", "Free space.")

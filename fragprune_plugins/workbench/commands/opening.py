@@ -12,7 +12,7 @@ import click
 import torch
 
 from fragprune_plugins.engines import Engine, device_for
-from fragprune_plugins.errors import RecordError, UsageError, printable
+from fragprune_plugins.errors import DatasetError, RecordError, UsageError, printable
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.plugins.hooks import engine_for
@@ -23,13 +23,7 @@ from fragprune_plugins.workbench.ranks import launched, local_rank
 from fragprune_plugins.workbench.scenes.cameras import divided, load_cameras, load_scene_cameras
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 from fragprune_plugins.workbench.scenes.generated import around, own_pictures
-from fragprune_plugins.workbench.scenes.output import (
-    ARGUMENTS,
-    cameras_of,
-    drawn_as_trained,
-    over_white,
-    trained_on,
-)
+from fragprune_plugins.workbench.scenes.output import ARGUMENTS, cameras_of, over_white, trained_on
 
 
 def bound_threads(threads: int | None) -> None:
@@ -61,20 +55,14 @@ def photographs_for(
     """The photographs that the options name; without --data those that the model was trained on.
 
     Options that were given override what the training says. Beside --data it still says whether
-    the model was drawn over white, and around the middle; so does the record of a fine-tuning.
+    the model was drawn over white, and around the middle.
 
     Raises:
         UsageError: there is no folder, and the model lies in no output folder with arguments.
         DatasetError: the training's arguments cannot be read.
     """
     if scene.data is not None:
-        photographs = drawn_as_trained(scene.data, model)
-        with contextlib.suppress(RecordError):
-            record = records.beside(model)
-            if record is not None and (read := records.recorded(record)):
-                known = read.photographs
-                photographs = replace(known, folder=scene.data, resolution=Resolution())
-        return overridden(replace(photographs, images="images"), scene)
+        return overridden(drawn_as_trained(scene.data, model), scene)
     trained = trained_on(model)
     if trained is None:
         raise UsageError(
@@ -87,6 +75,25 @@ def photographs_for(
         printable(f"Photographs: {trained.folder}, which the model was trained on"), err=True
     )
     return overridden(trained, scene)
+
+
+def drawn_as_trained(folder: Path, *models: Path) -> Photographs:
+    """A folder's photographs, over the background and around the point that models are drawn with.
+
+    The arguments in their output folders tell, and better than these the records beside them.
+    """
+    known = [Photographs(folder)]
+    for told in (trained_on, _recorded):
+        for model in models:
+            with contextlib.suppress(DatasetError, RecordError):
+                known.append(told(model) or known[-1])
+    return replace(known[-1], folder=folder, images="images", resolution=Resolution())
+
+
+def _recorded(model: Path) -> Photographs | None:
+    record = records.beside(model)
+    read = records.recorded(record) if record else None
+    return read.photographs if read else None
 
 
 def overridden(photographs: Photographs, scene: SceneOptions) -> Photographs:
@@ -139,13 +146,17 @@ class OwnCameras:
 
 
 def own_cameras_for(
-    model: Path, scene: SceneOptions, cameras: Path | None, seed: int = 0
+    model: Path, scene: SceneOptions, cameras: Path | None, seed: int = 0, *, orbit: bool = False
 ) -> OwnCameras:
     """The cameras that the options name; without any those of the model's training, if it is known.
 
     As its training did, it is drawn over white.
+
+    Args:
+        orbit: all around it, whatever is known.
     """
-    if scene.data is None and cameras is None and (cameras := cameras_of(model)):
+    named = orbit or scene.data is not None or cameras is not None
+    if not named and (cameras := cameras_of(model)):
         click.echo(printable(f"Cameras: {cameras}, of its training"), err=True)
     white = scene.white_background or over_white(model)
     return OwnCameras(replace(scene, white_background=white), cameras, seed)

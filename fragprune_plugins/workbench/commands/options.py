@@ -242,7 +242,8 @@ def scene_options(data: str = f"{DATA_HELP} {TRAINED_ON}") -> Callable[[Function
 
 def _own_pictures(given: dict[str, Any]) -> dict[str, Any]:
     itself, orbit, cameras = map(given.pop, ("itself", "orbit", "cameras"))
-    return {"itself": itself or orbit or cameras is not None, "cameras": cameras}
+    itself = itself or orbit or cameras is not None
+    return {"itself": itself, "orbit": orbit, "cameras": cameras}
 
 
 own_picture_options = bundled(
@@ -251,15 +252,16 @@ own_picture_options = bundled(
         "--self",
         "itself",
         is_flag=True,
-        help="Measure against the model's own pictures instead of photographs, from the "
-        "cameras of --data, or as --orbit.",
+        help="Measure against the model's own pictures instead of photographs, from the cameras "
+        "of --data; else of its training, if it lies in its output folder; else as --orbit.",
     ),
     click.option("--cameras", type=FILE, help="Likewise, from a cameras.json or transforms*.json."),
     click.option("--orbit", is_flag=True, help="Likewise, from cameras all around the model."),
 )
 """For what is compared with a model's own pictures.
 
-A command gets ``itself``, whether one of them was given, and ``cameras``, of a file or None.
+A command gets ``itself``, whether one of them was given, ``orbit``, and ``cameras``, of a file or
+None.
 ``CAMERAS_APART`` are its rules.
 """
 

@@ -13,6 +13,7 @@ from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import (
     OwnCameras,
     chosen,
+    drawn_as_trained,
     open_engine,
     overridden,
     own_cameras,
@@ -24,7 +25,7 @@ from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
 from fragprune_plugins.workbench.figures.pictures import leave_panels
 from fragprune_plugins.workbench.models.model import load, writable_folder
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
-from fragprune_plugins.workbench.scenes.output import drawn_as_trained, trained_on
+from fragprune_plugins.workbench.scenes.output import trained_on
 
 
 def compare(
@@ -32,6 +33,7 @@ def compare(
     a: Path,
     b: Path,
     itself: bool,
+    orbit: bool,
     cameras: Path | None,
     scene: SceneOptions,
     out: Path | None,
@@ -45,7 +47,7 @@ def compare(
     if out is not None:
         writable_folder(out)
     known = _records(a, b)
-    own = own_cameras_for(a, scene, cameras) if itself else None
+    own = own_cameras_for(a, scene, cameras, orbit=orbit) if itself else None
     if own is None and scene.data is None:
         own = _recorded_cameras(scene, a, b)
     photographs = None if own else _photographs(scene, known, a, b)

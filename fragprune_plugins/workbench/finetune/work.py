@@ -39,13 +39,7 @@ from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.models.model import require_place
 from fragprune_plugins.workbench.pruning import kept
 from fragprune_plugins.workbench.ranks import Ranks, joined, launched
-from fragprune_plugins.workbench.scenes.dataset import (
-    OFF_CENTRE,
-    Dataset,
-    Photograph,
-    Shot,
-    load_photographs,
-)
+from fragprune_plugins.workbench.scenes.dataset import OFF_CENTRE, Dataset, load_photographs
 from fragprune_plugins.workbench.scenes.generated import views_near
 from fragprune_plugins.workbench.scenes.output import CAMERAS
 from fragprune_plugins.workbench.scenes.training import exposed, moved, saw_held_out
@@ -130,8 +124,9 @@ def _open(asked: Asked) -> _Opened:
         dataset = own.pictures(whole, engine)
     else:
         assert photographs is not None
-        dataset = load_photographs(photographs)
-        if not asked.shard and any(_off_centre(shot) for shot in dataset.train):
+        if asked.shard:
+            dataset = load_photographs(photographs)
+        else:
             photographs, dataset = _aimed(whole, photographs, engine)
     checkpoints = Checkpoints(resuming.path_beside(asked.out), resuming.EVERY, tell=_say)
     configuration = resuming.configuration(whole, dataset, settings, engine.name)
@@ -139,26 +134,27 @@ def _open(asked: Asked) -> _Opened:
     return _Opened(asked, whole, photographs, dataset, engine, device, checkpoints, configuration)
 
 
-def _off_centre(shot: Shot) -> bool:
-    camera = shot.camera if isinstance(shot, Photograph) else None
-    return camera is not None and camera.off_centre > OFF_CENTRE
-
-
 def _aimed(model: Model, read: Photographs, engine: Engine) -> tuple[Photographs, Dataset]:
     """Photographs around the middle, or the scene's own principal point: as the model shows them.
 
     3DGS and most of its descendants take the middle, whatever the scene says; others do not.
     """
-    ways = [replace(read, centred=centred) for centred in (True, False)]
-    datasets = [load_photographs(each).to(model.device) for each in ways]
-    shown = [
-        statistics.fmean(psnrs(Candidate(model), evenly_spaced(each.train, 8), engine)[0])
-        for each in datasets
-    ]
-    best = shown.index(max(shown))
-    where = ("the middle", "the scene's principal point")[best]
-    _say(f"MODEL is drawn around {where}: {shown[best]:.1f} dB, {shown[1 - best]:.1f} otherwise.")
-    return ways[best], datasets[best]
+    dataset = load_photographs(replace(read, centred=True))  # nothing is wrong with another point
+    if dataset.off_centre <= OFF_CENTRE:
+        return read, dataset.aimed(read.centred)
+    ways = [dataset.aimed(centred).to(model.device) for centred in (False, True)]
+    own, middle = (_shown(model, each, engine) for each in ways)
+    centred = middle >= own
+    where, otherwise = "the middle", own
+    if not centred:
+        where, otherwise = "the scene's principal point", middle
+    _say(f"MODEL is drawn around {where}: {max(own, middle):.1f} dB, {otherwise:.1f} otherwise.")
+    return replace(read, centred=centred), ways[centred]
+
+
+def _shown(model: Model, dataset: Dataset, engine: Engine) -> float:
+    """How well a model shows up to eight training pictures, dB of PSNR."""
+    return statistics.fmean(psnrs(Candidate(model), evenly_spaced(dataset.train, 8), engine)[0])
 
 
 def _finished(opened: _Opened) -> Report | None:
@@ -186,8 +182,7 @@ def _tried(opened: _Opened) -> tuple[_Opened, float | None]:
 
 def _warn_of_another_scene(opened: _Opened, dataset: Dataset) -> None:
     """Warn before the learning of photographs that the model does not show."""
-    shots = evenly_spaced(dataset.train, 8)
-    shown = statistics.fmean(psnrs(Candidate(opened.whole), shots, opened.engine)[0])
+    shown = _shown(opened.whole, dataset, opened.engine)
     if shown < OTHER_SCENE:
         _say(
             f"warning: MODEL shows its photographs at {shown:.1f} dB PSNR, as if they were of "

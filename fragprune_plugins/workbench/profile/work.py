@@ -26,6 +26,7 @@ def profile(
     *,
     model: Path,
     itself: bool,
+    orbit: bool,
     cameras: Path | None,
     scene: SceneOptions,
     out: Path | None,
@@ -39,7 +40,8 @@ def profile(
         writable_folder(out)
     loaded = load(model, truncation=not no_truncation, device=device)
     if itself:
-        dataset = own_cameras_for(model, scene, cameras).pictures(loaded.untruncated(), rasterizer)
+        own = own_cameras_for(model, scene, cameras, orbit=orbit)
+        dataset = own.pictures(loaded.untruncated(), rasterizer)
     else:
         remedy = "Name the scene's folder with --data; without photographs, pass --self."
         dataset = load_photographs(photographs_for(model, scene, remedy=remedy)).to(device)

@@ -72,6 +72,10 @@ class Shot:
         """A picture of this view (3, H, W), black where the target is not to be looked at."""
         return image
 
+    def aimed(self: SomeShot, centred: bool) -> SomeShot:
+        """The same picture around its middle, or around its camera's principal point, if known."""
+        return self
+
     def to(self: SomeShot, device: torch.device | str) -> SomeShot:
         """The same with its view on a device; ``self`` if it is there already."""
         if self.view.background.device == torch.device(device):
@@ -138,6 +142,15 @@ class Photograph(Shot):
     _pixels: PixelSlot = field(default_factory=PixelSlot, repr=False)
 
     __repr__ = one_line
+
+    def aimed(self, centred: bool) -> Photograph:
+        """The same pixels around the middle, or around the principal point of ``camera``."""
+        if self.camera is None:
+            return self
+        seen, behind = self.camera.resized(self.view.width, self.view.height), self.view.background
+        if centred:
+            seen = replace(seen, cx=seen.width / 2, cy=seen.height / 2)
+        return replace(self, view=seen.view(behind.cpu())).to(behind.device)
 
     @property
     def image(self) -> Tensor:
@@ -223,6 +236,18 @@ class Dataset:
         )
         return len(train & test)
 
+    @property
+    def off_centre(self) -> float:
+        """How far a photograph's principal point is off its middle, at most, in its own pixels."""
+        cameras = (getattr(shot, "camera", None) for shot in (*self.train, *self.test))
+        return max((each.off_centre for each in cameras if each), default=0.0)
+
+    def aimed(self, centred: bool) -> Dataset:
+        """The same photographs around their middle, or around their cameras' principal points."""
+        return Dataset(
+            [s.aimed(centred) for s in self.train], [s.aimed(centred) for s in self.test]
+        )
+
     def to(self, device: torch.device | str) -> Dataset:
         """The same photographs with their views on a device."""
         return Dataset([s.to(device) for s in self.train], [s.to(device) for s in self.test])
@@ -267,12 +292,11 @@ def load_dataset(
             found, expected = f"the photograph of {views} views", "a photograph for each view"
             remedy = "Keep the sub-folders that the scene names below its folder of images."
             raise DatasetError(str(path), found, expected, remedy)
-    train, test = ([make_shot(row, background, size, centred) for row in part] for part in rows)
-    dataset = Dataset(train, test)
-    off = max(
-        (row.camera.off_centre for part in rows for row in part if row.lens is None), default=0
-    )
-    if off > OFF_CENTRE and not centred and not transforms.has_transforms(Path(folder)):
+    train, test = ([make_shot(row, background, size) for row in part] for part in rows)
+    dataset = Dataset(train, test).aimed(centred)
+    straight = all(row.lens is None for part in rows for row in part)
+    off = dataset.off_centre if straight and not centred else 0
+    if off > OFF_CENTRE and not transforms.has_transforms(Path(folder)):
         log.warning(
             "%s: the principal point is up to %.1f pixels off the middle, which 3DGS and most of "
             "its descendants ignore: figures of their models are wrong, unless these lie in their "
@@ -338,17 +362,13 @@ def _image_folder(folder: Path, images: str) -> str:
     return images
 
 
-def make_shot(
-    row: Posed, background: Tensor, resolution: Resolution, centred: bool = False
-) -> Photograph:
+def make_shot(row: Posed, background: Tensor, resolution: Resolution) -> Photograph:
     """Pair an image file with its camera. This reads only the file's header."""
     width, height = image_size(row.image)
     camera = row.camera
     _expect_aspect(row.image, (width, height), "its camera", (camera.width, camera.height))
-    seen = camera.resized(*resolution.of(width, height))
-    if centred:
-        seen = replace(seen, cx=seen.width / 2, cy=seen.height / 2)
-    return Photograph(row.name, seen.view(background), row.image, camera, row.lens, row.mask)
+    view = camera.resized(*resolution.of(width, height)).view(background)
+    return Photograph(row.name, view, row.image, camera, row.lens, row.mask)
 
 
 def _expect_aspect(

@@ -128,19 +128,6 @@ def over_white(model: Path) -> bool:
     return False
 
 
-def drawn_as_trained(folder: Path, *models: Path) -> Photographs:
-    """A folder's photographs, over the background and around the middle that models' trainings had.
-
-    These are known by the arguments in the models' output folders.
-    """
-    known = []
-    for model in models:
-        with contextlib.suppress(DatasetError):
-            known.append(trained_on(model))
-    white = any(each.white_background for each in known if each)
-    return Photographs(folder, white_background=white, centred=any(known))
-
-
 def _call(text: str) -> ast.Call:
     """The Namespace that a text is."""
     tree = parsed(text.strip())

@@ -15,12 +15,13 @@ from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.reading import lies_in
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.workbench.commands.command import Report
+from fragprune_plugins.workbench.commands.opening import drawn_as_trained
 from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.figures.viewing import overview
 from fragprune_plugins.workbench.models.model import load, writable_folder
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
-from fragprune_plugins.workbench.scenes.output import cameras_of, drawn_as_trained, output_folder
+from fragprune_plugins.workbench.scenes.output import cameras_of, output_folder
 from fragprune_plugins.workbench.view.site import (
     Layer,
     Shown,
