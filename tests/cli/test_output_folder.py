@@ -56,10 +56,14 @@ def test_pictures_are_drawn_as_the_training_did_around_the_middle(output, data, 
             assert run_json("profile", output, *more)["psnr"] == psnr[name]
         assert run_json("compare", output, output, "--data", data)["a"]["psnr"] == psnr[name]
     assert psnr["own"] == psnr["middle"]
-    run_json("finetune", output, "--out", pruned := tmp_path / "pruned.ply", "--iters", 2)
-    psnr = run_json("profile", pruned, "--data", data)["psnr"]  # of "middle"
-    (data / "sparse" / "0" / "cameras.txt").write_text(f"{lens} 20 16\n")
-    assert run_json("profile", pruned, "--data", data)["psnr"] == psnr
+    for more in ((), ("--self",)):
+        words = ("--out", pruned := tmp_path / f"pruned{len(more)}.ply", "--iters", 2)
+        run_json("finetune", output, *words, *more)
+        psnr = {}
+        for centre in ("16 16", "20 16"):
+            (data / "sparse" / "0" / "cameras.txt").write_text(f"{lens} {centre}\n")
+            psnr[centre] = run_json("profile", pruned, "--data", data)["psnr"]
+        assert psnr["16 16"] == psnr["20 16"]
 
 
 @pytest.mark.parametrize("middle", [True, False])

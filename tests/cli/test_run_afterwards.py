@@ -113,12 +113,13 @@ def test_a_model_with_exposures_learns_from_its_own_pictures(host, photographs, 
     assert json.loads(result.stdout)["target"] == "itself"
 
 
+@pytest.mark.parametrize(("old", "new"), [("/cfg_args", "/other_args"), ("source_path=", "")])
 def test_without_its_arguments_photographs_are_read_as_the_command_says(
-    host, photographs, tmp_path
+    host, photographs, tmp_path, old, new
 ):
     words = host(photographs)
     script = words[2]
-    script.write_text(script.read_text().replace("/cfg_args", "/other_args"))
+    script.write_text(script.read_text().replace(old, new))
     result = run("run", *WORDS, *words, "-r", 2, "-w")
     assert result.exit_code == 0, result.stderr
     record = beside(tmp_path / "out/point_cloud/iteration_9/pruned.ply")

@@ -91,9 +91,12 @@ def drawn_as_trained(folder: Path, *models: Path) -> Photographs:
 
 
 def _recorded(model: Path) -> Photographs | None:
-    record = records.beside(model)
-    read = records.recorded(record) if record else None
-    return read.photographs if read else None
+    """The photographs in a model's record; of its own pictures, those of the model before."""
+    if (record := records.beside(model)) is None:
+        return None
+    if read := records.recorded(record):
+        return read.photographs
+    return trained_on(records.located(str(record.data.get("model")), record.path.parent))
 
 
 def overridden(photographs: Photographs, scene: SceneOptions) -> Photographs:

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import re
 import subprocess
 import sys
 import time
-from argparse import Namespace
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from fragprune_plugins.errors import HostFailed, UsageError
+from fragprune_plugins.errors import DatasetError, HostFailed, UsageError
 from fragprune_plugins.hosts.adapter import Flags
 from fragprune_plugins.hosts.choosing import attempt, folder_above
-from fragprune_plugins.hosts.photographs import Photographs, Resolution
+from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.command import split
 from fragprune_plugins.learning.interruption import Terminate, sigterm_interrupts
@@ -26,7 +26,7 @@ from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOpt
 from fragprune_plugins.workbench.finetune.work import finetune
 from fragprune_plugins.workbench.saved import models_of
 from fragprune_plugins.workbench.scenes.dataset import read_scene
-from fragprune_plugins.workbench.scenes.output import DIVISORS, cameras_of, trained_on
+from fragprune_plugins.workbench.scenes.output import cameras_of, told_by, trained_on
 from fragprune_plugins.workbench.scenes.training import exposed
 
 log = logging.getLogger("fragprune")
@@ -42,15 +42,16 @@ class Unserved:
     Attributes:
         program: the words of the command that name what the interpreter runs.
         arguments: those after them.
-        flags: those that 3DGS has: output and source, None where not given, and how it reads
-            photographs: images, resolution, white_background.
+        output: the folder that it names as 3DGS does; None if it names none.
+        photographs: likewise, and how it reads them.
         why: what speaks against the nearest adapter.
         unlike: why its model's pictures may differ from the photographs; see ``Plain``.
     """
 
     program: tuple[str, ...]
     arguments: tuple[str, ...]
-    flags: Namespace
+    output: Path | None
+    photographs: Photographs | None
     why: str
     unlike: str = ""
 
@@ -81,21 +82,13 @@ class Unserved:
         Raises:
             HostFailed: there is none.
         """
-        folder: Path = self.flags.output or Path.cwd()
+        folder = self.output or Path.cwd()
         for place in (folder, Path.cwd()) if since else (folder,):
             found = [each for each in place.rglob(_SAVED) if each.stat().st_mtime >= since]
             if found:
                 return max(found, key=lambda each: (-len(each.parts), each.stat().st_mtime))
         what = f"no {_SAVED} in {folder}" + (" since it began" if since else "")
         raise HostFailed(self.program[-1], what, "the model that it trained", _BY_HAND)
-
-    def photographs(self) -> Photographs | None:
-        """Those that the command names, read as its flags say; None if it names none."""
-        flags = self.flags
-        if flags.source is None:
-            return None
-        size = Resolution.asked(int(flags.resolution), DIVISORS)
-        return Photographs(flags.source, size, flags.white_background, flags.images, centred=True)
 
 
 def unserved(command: Sequence[str]) -> Unserved | None:
@@ -114,14 +107,16 @@ def unserved(command: Sequence[str]) -> Unserved | None:
         return None
     program = ("-m", module) if module else (str(script),)
     parser = Flags(add_help=False, allow_abbrev=False)
-    parser.add_argument("-m", "--model_path", dest="output", type=Path)
-    parser.add_argument("-s", "--source_path", dest="source", type=Path)
+    parser.add_argument("-m", "--model_path", type=Path)
+    parser.add_argument("-s", "--source_path")
     parser.add_argument("-i", "--images", default="images")
     parser.add_argument("-r", "--resolution", type=float, default=-1)
     parser.add_argument("-w", "--white_background", action="store_true")
-    flags, _ = parser.parse_known_args(arguments)
+    flags = vars(parser.parse_known_args(arguments)[0])
+    photographs = told_by(flags) if flags["source_path"] else None
     why = tried[0].brief() if tried else "none is installed"
-    return Unserved(program, tuple(arguments), flags, why, own.unlike)
+    output = flags["model_path"]
+    return Unserved(program, tuple(arguments), output, photographs, why, own.unlike)
 
 
 def train_then_finetune(
@@ -146,31 +141,35 @@ def train_then_finetune(
     """
     settings = _settings_of(host.unlike, settings)
     log.info("no adapter fits (%s), but its PLY is plain 3DGS", host.why)
-    source, since = host.flags.source, 0.0
-    if source is not None:  # better now than after a training
-        read_scene(source, host.flags.images)
+    photographs, since = host.photographs, 0.0
+    if photographs is not None:  # better now than after a training
+        read_scene(photographs.folder, photographs.images)
     if stage == "auto":
         since = time.time() - 1  # file systems round
         log.info("it trains as it is, by itself")
         host.train(quietly=json)
-    elif host.flags.output is None:
+    elif host.output is None:
         remedy = "Add -m FOLDER, also if the training knows no -m: it is not started again."
         raise UsageError("command", "no -m", "the output folder of the training", remedy)
     model = host.saved(since)
     if not host.unlike and (name := exposed(model)):
         settings = _settings_of(f"it learned an exposure for {name}", settings)
     out = model.with_name("pruned.ply" if settings.goal.presses else "control.ply")
-    photographs = trained_on(model) or host.photographs()
+    with contextlib.suppress(DatasetError):  # what it wrote as its arguments may be anything
+        photographs = trained_on(model) or photographs
     log.info("%s learns by vanilla 3DGS's drawing and loss, as in fragprune finetune", model)
-    if photographs is not None and not settings.itself:
-        log.info("from the photographs in %s", photographs.folder)
-    data = None if not settings.itself or cameras_of(model) else host.flags.source
+    scene = SceneOptions()
+    if photographs is not None:
+        data = None if settings.itself and cameras_of(model) else photographs.folder
+        scene = SceneOptions(data, white_background=photographs.white_background)
+        if not settings.itself:
+            log.info("from the photographs in %s", data)
     report = finetune(
         model=model,
         out=out,
         itself=settings.itself,
         cameras=None,
-        scene=SceneOptions(data, white_background=host.flags.white_background),
+        scene=scene,
         settings=settings,
         keep=None,
         seed=settings.seed,

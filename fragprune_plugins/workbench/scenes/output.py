@@ -10,6 +10,7 @@ import ast
 import contextlib
 import logging
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from fragprune_plugins.hosts.source import parsed
 
 ARGUMENTS, CAMERAS = "cfg_args", "cameras.json"
 
-DIVISORS = (1, 2, 4, 8)  # of -r; other numbers are widths
+_DIVISORS = (1, 2, 4, 8)  # of -r; other numbers are widths
 
 _FILE = UntrustedFile(
     DatasetError,
@@ -110,14 +111,18 @@ def _arguments(model: Path) -> tuple[Photographs, bool] | None:
                 reading.place = word.arg
                 values[word.arg] = ast.literal_eval(word.value)
         reading.place = ""
-        photographs = Photographs(
-            Path(str(values["source_path"])),
-            Resolution.asked(int(values.get("resolution", -1)), DIVISORS),
-            bool(values.get("white_background", False)),
-            str(values.get("images", "images")),
-            centred=True,
-        )
-    return photographs, bool(values.get("eval", False))
+        return told_by(values), bool(values.get("eval", False))
+
+
+def told_by(values: Mapping[str, Any]) -> Photographs:
+    """The photographs that the arguments of a 3DGS host name, by their names there."""
+    return Photographs(
+        Path(str(values["source_path"])),
+        Resolution.asked(int(values.get("resolution", -1)), _DIVISORS),
+        bool(values.get("white_background", False)),
+        str(values.get("images", "images")),
+        centred=True,
+    )
 
 
 def over_white(model: Path) -> bool:
