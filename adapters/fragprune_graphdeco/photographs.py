@@ -108,10 +108,5 @@ def _parts(function: Function, node: ast.expr) -> list[ast.expr]:
     if not isinstance(node, ast.Name):
         return []
     changed = (each for each in every(function, ast.AugAssign) if text_of(each.target) == node.id)
-    made = [made for to, made in assigned(function) if _first(to) == node.id]
-    return [*made, *(each.value for each in changed)]
-
-
-def _first(target: ast.expr) -> str:
-    """The name that gets a value, or the first part of one that has several."""
-    return text_of(target.elts[0] if isinstance(target, ast.Tuple) else target)
+    named = ((map(text_of, getattr(to, "elts", [to])), made) for to, made in assigned(function))
+    return [*(made for names, made in named if node.id in names), *(each.value for each in changed)]

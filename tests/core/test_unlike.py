@@ -53,6 +53,7 @@ def test_the_drawn_picture_is_compared_with_the_photograph(tmp_path, written):
     ("written", "compared"),
     [
         ({"between": "image = water(image, depth) + image"}, "image with gt_image"),
+        ({"between": "behind, image = gaussians.adjusted(image)"}, "image with gt_image"),
         ({"between": "image = image * torch.exp(gain)"}, "image with gt_image"),
         ({"loss": "ssim(image * exposure, gt_image)"}, "image * exposure with gt_image"),
         ({"loss": "l1_loss(image * mask, gt_image * mask)"}, "image * mask with gt_image * mask"),
