@@ -62,7 +62,7 @@ def photographs_for(
         DatasetError: the training's arguments cannot be read.
     """
     if scene.data is not None:
-        return overridden(drawn_as_trained(scene.data, model), scene)
+        return drawn_as_trained(scene, model)
     trained = trained_on(model)
     if trained is None:
         raise UsageError(
@@ -77,17 +77,17 @@ def photographs_for(
     return overridden(trained, scene)
 
 
-def drawn_as_trained(folder: Path, *models: Path) -> Photographs:
-    """A folder's photographs, over the background and around the point that models are drawn with.
+def drawn_as_trained(scene: SceneOptions, *models: Path) -> Photographs:
+    """The photographs in --data, over the background and around the point of models' trainings.
 
     The arguments in their output folders tell, and better than these the records beside them.
     """
-    known = [Photographs(folder)]
+    known = [Photographs(Path())]
     for told in (trained_on, _recorded):
         for model in models:
             with contextlib.suppress(DatasetError, RecordError):
                 known.append(told(model) or known[-1])
-    return replace(known[-1], folder=folder, images="images", resolution=Resolution())
+    return overridden(replace(known[-1], images="images", resolution=Resolution()), scene)
 
 
 def _recorded(model: Path) -> Photographs | None:

@@ -152,4 +152,4 @@ def _photographs(
             "a scene folder, or A's own pictures",
             "Name it with --data; without photographs, pass --self.",
         )
-    return overridden(drawn_as_trained(scene.data, *models), scene)
+    return drawn_as_trained(scene, *models)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import webbrowser
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from fragprune_plugins.files.reading import lies_in
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import drawn_as_trained
+from fragprune_plugins.workbench.commands.options import SceneOptions
 from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.figures.viewing import overview
 from fragprune_plugins.workbench.models.model import load, writable_folder
@@ -58,7 +58,8 @@ def view(
     if truncated == [True, False]:  # the original stands left of the split
         for each in (paths, models, truncated):
             each.reverse()
-    read = None if data is None else drawn_as_trained(data, *paths)
+    scene = SceneOptions(data, white_background=white_background)
+    read = drawn_as_trained(scene, *paths) if data else None
     shown = _cameras(read, cameras or cameras_of(model), white_background)
     if shown:
         start = shown[0].view
@@ -132,9 +133,7 @@ def _told_apart(left: Path, right: Path) -> tuple[str, str]:
 def _cameras(data: Photographs | None, cameras: Path | None, white_background: bool) -> list[Shown]:
     """The cameras of the page's list: held-out ones of a scene, or all of a file."""
     if data is not None:
-        white = white_background or data.white_background
-        shots = load_photographs(replace(data, white_background=white)).test
-        return [Shown(shot.name, shot.view, shot) for shot in shots]
+        return [Shown(shot.name, shot.view, shot) for shot in load_photographs(data).test]
     if cameras is not None:
         named = load_cameras(cameras, white_background=white_background)
         return [Shown(name, camera) for name, camera in named]
