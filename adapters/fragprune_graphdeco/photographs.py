@@ -42,7 +42,7 @@ def _of_script(repo: HostRepo, script: str) -> Iterator[str]:
     """``unlike`` of a script and what it imports; nothing if none of that learns."""
     why, learns, known = NOT_FOUND, False, reading.as_options(repo, ("arguments", script))
     for module, tree in reading.reached(repo, [script]).items():
-        for function in filter(_learns, every(tree, ast.FunctionDef)):
+        for function in reading.learning(tree):
             learns, gone = True, reading.skipped(function, known)
             for node, sides in _compared(function):
                 kinds = [_kinds(function, each, gone) for each in sides]
@@ -54,11 +54,6 @@ def _of_script(repo: HostRepo, script: str) -> Iterator[str]:
                     texts = " with ".join(text_of(each)[:40] for each in sides)
                     yield f"its training compares {texts} ({repo.at(module, node.lineno)})"
     yield from [why] * learns
-
-
-def _learns(function: Function) -> bool:
-    """Whether it calls a loss's ``backward``."""
-    return any(getattr(n.func, "attr", "") == "backward" for n in every(function, ast.Call))
 
 
 def _compared(function: Function) -> Iterator[tuple[ast.expr, list[ast.expr]]]:

@@ -170,14 +170,19 @@ def failing(repo: HostRepo, scripts: Collection[str]) -> list[str]:
         found += [f"{script} trains by jittor"] * ("jittor" in imported(tree))
         found += [
             f"{script} compiles {node.name}, which trains"
-            for node in every(tree, ast.FunctionDef)
+            for node in learning(tree)
             if any("torch.compile" in text_of(each) for each in node.decorator_list)
-            and any(getattr(each, "attr", "") == "backward" for each in nodes(node))
         ]
         module = module_of(script)
         found += (*_misfits(repo, module), *_absent(repo, module), *_own_folders(repo, module))[:1]
         found += [f"{script} draws by {each}" for each in _drawn_elsewhere(repo, module)][:1]
     return found
+
+
+def learning(tree: ast.AST | None) -> list[ast.FunctionDef]:
+    """The functions that call a loss's ``backward``."""
+    found = every(tree, ast.FunctionDef)
+    return [f for f in found if any(getattr(n, "attr", "") == "backward" for n in nodes(f))]
 
 
 def _left_out(repo: HostRepo, scripts: Iterable[str]) -> Iterator[str]:

@@ -128,16 +128,26 @@ def test_without_its_arguments_photographs_are_read_as_the_command_says(
     assert read == Photographs(photographs, Resolution(divide=2), **how)
 
 
-def test_what_a_host_makes_of_its_model_in_a_folder_below_is_not_taken(host, photographs, tmp_path):
-    """Self-Organizing-Gaussians compresses it, and writes what comes out again."""
-    words, below = host(photographs), "/coded/name/point_cloud/iteration_1"
+BELOW = "/coded/name/point_cloud/iteration_1"
+COPIES = f"out + '/point_cloud/iteration_9', out + {BELOW!r}, copy_function=shutil.copy"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "place"),
+    [  # Self-Organizing-Gaussians compresses its model, and writes what comes out again
+        ("\nprint(", f"\nshutil.copytree({COPIES})\nprint(", "out"),
+        ("= sys.argv[2], sys.argv[4]", "= sys.argv[2], 'own'", "own"),
+    ],
+    ids=["made of it, in a folder below", "in a folder that it chooses"],
+)
+def test_the_model_is_what_was_trained(host, photographs, tmp_path, monkeypatch, old, new, place):
+    words = host(photographs)
     script = words[2]
-    copied = f"out + '/point_cloud/iteration_9', out + {below!r}, copy_function=shutil.copy"
-    text = script.read_text().replace("\nprint(", f"\nshutil.copytree({copied})\nprint(")
-    script.write_text(text)
+    script.write_text(script.read_text().replace(old, new))
+    monkeypatch.chdir(tmp_path)
     data = json.loads(run("run", "--json", *WORDS, *words).stdout)
-    assert (tmp_path / f"out{below}/point_cloud.ply").exists()
-    assert data["model_before"] == str(tmp_path / "out/point_cloud/iteration_9/point_cloud.ply")
+    assert (tmp_path / f"out{BELOW}/point_cloud.ply").exists() == (place == "out")
+    assert data["model_before"] == str(tmp_path / place / "point_cloud/iteration_9/point_cloud.ply")
 
 
 def test_a_script_in_a_folder_of_its_codebase_is_served(host, photographs, tmp_path):
@@ -235,19 +245,6 @@ def test_what_only_an_adapter_can_do_is_refused(more, host, photographs, tmp_pat
 def test_photographs_that_we_cannot_read_are_said_before_the_training(host, tmp_path):
     fails("run", *WORDS, *host(tmp_path / "nothing"), says="[dataset]", code=1)
     assert not (tmp_path / "out").exists()
-
-
-def test_a_training_may_choose_its_folder_below_the_working_one(
-    host, photographs, tmp_path, monkeypatch
-):
-    words = host(photographs)
-    script = words[2]
-    monkeypatch.chdir(tmp_path)
-    script.write_text(
-        script.read_text().replace("= sys.argv[2], sys.argv[4]", "= sys.argv[2], 'o'")
-    )
-    data = json.loads(run("run", "--json", *WORDS, *words).stdout)
-    assert data["model_before"] == str(tmp_path / "o/point_cloud/iteration_9/point_cloud.ply")
 
 
 def test_a_script_that_trains_another_model_than_was_read_is_not_trained(

@@ -43,15 +43,15 @@ class Asked:
     model: Path
     out: Path
     itself: bool
-    cameras: Path | None
     scene: SceneOptions
     settings: Settings
-    keep: Keep | None
     seed: int
-    shard: bool
-    no_truncation: bool
     again: bool
     engine: EngineOptions
+    cameras: Path | None = None
+    keep: Keep | None = None
+    shard: bool = False
+    no_truncation: bool = False
     command: str = "finetune"
     photographs: Photographs | None = None
 

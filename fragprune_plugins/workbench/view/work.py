@@ -12,7 +12,6 @@ import torch
 from fragprune_plugins.errors import OutputError
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.reading import lies_in
-from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import drawn_as_trained
 from fragprune_plugins.workbench.commands.options import SceneOptions
@@ -59,8 +58,7 @@ def view(
         for each in (paths, models, truncated):
             each.reverse()
     scene = SceneOptions(data, white_background=white_background)
-    read = drawn_as_trained(scene, *paths) if data else None
-    shown = _cameras(read, cameras or cameras_of(model), white_background)
+    shown = _cameras(scene, cameras or cameras_of(model), paths)
     if shown:
         start = shown[0].view
     else:
@@ -130,12 +128,13 @@ def _told_apart(left: Path, right: Path) -> tuple[str, str]:
     return str(left), str(right)
 
 
-def _cameras(data: Photographs | None, cameras: Path | None, white_background: bool) -> list[Shown]:
+def _cameras(scene: SceneOptions, cameras: Path | None, models: list[Path]) -> list[Shown]:
     """The cameras of the page's list: held-out ones of a scene, or all of a file."""
-    if data is not None:
-        return [Shown(shot.name, shot.view, shot) for shot in load_photographs(data).test]
+    if scene.data is not None:
+        shots = load_photographs(drawn_as_trained(scene, *models)).test
+        return [Shown(shot.name, shot.view, shot) for shot in shots]
     if cameras is not None:
-        named = load_cameras(cameras, white_background=white_background)
+        named = load_cameras(cameras, white_background=scene.white_background)
         return [Shown(name, camera) for name, camera in named]
     return []
 
