@@ -112,9 +112,8 @@ def overridden(photographs: Photographs, scene: SceneOptions) -> Photographs:
 
 def chosen(dataset: Dataset, views: str) -> Sequence[Shot]:
     """The views that ``--views`` names: "test", "train" or "all"."""
-    return {"test": dataset.test, "train": dataset.train, "all": [*dataset.train, *dataset.test]}[
-        views
-    ]
+    named = {"test": dataset.test, "train": dataset.train, "all": [*dataset.train, *dataset.test]}
+    return named[views]
 
 
 @dataclass(frozen=True)

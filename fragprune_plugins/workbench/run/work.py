@@ -179,8 +179,8 @@ def figures_of(
         "before": before,
         "after": after,
         "not_compared": not_compared and not_compared.as_dict(),
-        "model_before": _text(summary.model_before),
-        "model_after": _text(summary.model_after),
+        "model_before": summary.model_before and str(summary.model_before),
+        "model_after": summary.model_after and str(summary.model_after),
         "seen": looking.seen,
         "keep": trial and trial.keep,
         "forgotten": trial and trial.forgotten,
@@ -208,10 +208,6 @@ def _saved(summary: launch.RunSummary) -> str:
     """Where a model is that is no PLY."""
     kept = summary.output is not None and any(summary.output.glob("*.ckpt"))
     return f"the last checkpoint in {summary.output}" if kept else "not saved by the host"
-
-
-def _text(path: Path | None) -> str | None:
-    return None if path is None else str(path)
 
 
 def photographs_of(summary: launch.RunSummary) -> records.Recorded | None:

@@ -72,10 +72,6 @@ class Shot:
         """A picture of this view (3, H, W), black where the target is not to be looked at."""
         return image
 
-    def aimed(self: SomeShot, centred: bool) -> SomeShot:
-        """The same picture around its middle, or around its camera's principal point, if known."""
-        return self
-
     def to(self: SomeShot, device: torch.device | str) -> SomeShot:
         """The same with its view on a device; ``self`` if it is there already."""
         if self.view.background.device == torch.device(device):
@@ -144,7 +140,7 @@ class Photograph(Shot):
     __repr__ = one_line
 
     def aimed(self, centred: bool) -> Photograph:
-        """The same pixels around the middle, or around the principal point of ``camera``."""
+        """The same pixels around the middle, or around the principal point of its camera."""
         if self.camera is None:
             return self
         seen, behind = self.camera.resized(self.view.width, self.view.height), self.view.background
@@ -243,10 +239,12 @@ class Dataset:
         return max((each.off_centre for each in cameras if each), default=0.0)
 
     def aimed(self, centred: bool) -> Dataset:
-        """The same photographs around their middle, or around their cameras' principal points."""
-        return Dataset(
-            [s.aimed(centred) for s in self.train], [s.aimed(centred) for s in self.test]
+        """The same with ``aimed`` photographs."""
+        train, test = (
+            [shot.aimed(centred) if isinstance(shot, Photograph) else shot for shot in part]
+            for part in (self.train, self.test)
         )
+        return Dataset(train, test)
 
     def to(self, device: torch.device | str) -> Dataset:
         """The same photographs with their views on a device."""
