@@ -61,11 +61,11 @@ class Photographs:
         resolution: of the images.
         white_background: images with alpha are composited over white instead of black.
         images: name of the folder of a COLMAP scene that holds the images.
-        centred: the host takes the middle of a picture for its principal point, as 3DGS does.
+        centred: whether the principal point is a picture's middle, as in 3DGS; None if unknown.
     """
 
     folder: Path
     resolution: Resolution = Resolution()
     white_background: bool = False
     images: str = "images"
-    centred: bool = False
+    centred: bool | None = None

@@ -79,6 +79,7 @@ def test_hosts_of_3dgs_take_the_middle_for_the_principal_point(colmap, caplog):
     shot = load_dataset(colmap, centred=True).train[0]
     assert torch.equal(shot.view.projmatrix, whole.view.projmatrix)
     assert torch.equal(shot.image, whole.image)
+    load_dataset(colmap, centred=False)
     assert not caplog.text
     load_dataset(colmap)
     assert "principal point is up to 4.0 pixels off" in caplog.text

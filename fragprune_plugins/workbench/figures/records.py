@@ -204,7 +204,8 @@ def recorded(record: Record) -> Recorded | None:
         filtered = bool(values["filtered"])
         scene, size = located(values["folder"], folder), Resolution(**values["resolution"])
         white, images = values["white_background"], values["images"]
-        photographs = Photographs(scene, size, white, images, bool(values.get("centred")))
+        centred = None if values.get("centred") is None else bool(values["centred"])
+        photographs = Photographs(scene, size, white, images, centred)
         return Recorded(photographs, models, filtered, drawing)
 
 

@@ -141,7 +141,7 @@ def _aimed(model: Model, read: Photographs, engine: Engine) -> tuple[Photographs
     """
     dataset = load_photographs(replace(read, centred=True))  # nothing is wrong with another point
     if dataset.off_centre <= OFF_CENTRE:
-        return read, dataset.aimed(read.centred)
+        return read, dataset.aimed(bool(read.centred))
     ways = [dataset.aimed(centred).to(model.device) for centred in (False, True)]
     own, middle = (_shown(model, each, engine) for each in ways)
     centred = middle >= own

@@ -262,7 +262,7 @@ def load_dataset(
     resolution: int | Resolution = 1,
     white_background: bool = False,
     images: str = "images",
-    centred: bool = False,
+    centred: bool | None = None,
 ) -> Dataset:
     """Read a COLMAP folder (sparse/, images/), or Blender's or nerfstudio's transforms files.
 
@@ -275,7 +275,8 @@ def load_dataset(
         white_background: composite images with alpha over white instead of black, and render so.
         images: name of the image folder, if it is not ``images`` or not what the transforms say.
             Without ``images/``, the largest of ``images_2``, ``images_4`` and ``images_8`` serves.
-        centred: render as if each principal point was the middle of its picture, as 3DGS does.
+        centred: render as if each principal point was the middle of its picture, as 3DGS does. None
+            does not, but warns where it makes a difference.
 
     Raises:
         DatasetError: the folder has neither layout or both, an image is missing, a camera model is
@@ -291,9 +292,9 @@ def load_dataset(
             remedy = "Keep the sub-folders that the scene names below its folder of images."
             raise DatasetError(str(path), found, expected, remedy)
     train, test = ([make_shot(row, background, size) for row in part] for part in rows)
-    dataset = Dataset(train, test).aimed(centred)
+    dataset = Dataset(train, test).aimed(bool(centred))
     straight = all(row.lens is None for part in rows for row in part)
-    off = dataset.off_centre if straight and not centred else 0
+    off = dataset.off_centre if straight and centred is None else 0
     if off > OFF_CENTRE and not transforms.has_transforms(Path(folder)):
         log.warning(
             "%s: the principal point is up to %.1f pixels off the middle, which 3DGS and most of "
