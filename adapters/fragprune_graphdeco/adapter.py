@@ -544,7 +544,7 @@ class GraphdecoAdapter(ScriptAdapter):
 def _centred(repo: HostRepo) -> bool:
     """Whether cameras get their projection of two planes and two angles, around the middle."""
     usual, calls = "getProjectionMatrix", every(repo.tree("scene.cameras"), ast.Call)
-    made = [each for each in calls if text_of(each.func).startswith(usual)]
+    made = [each for each in calls if getattr(each.func, "id", "").startswith(usual)]
     return all(text_of(c.func) == usual and len(c.args) + len(c.keywords) == 4 for c in made)
 
 

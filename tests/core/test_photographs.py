@@ -88,9 +88,9 @@ def test_the_middle_is_the_principal_point_of_a_host_that_reads_no_other(tmp_pat
     shutil.copytree(HOST.root, tmp_path, dirs_exist_ok=True)
     source = tmp_path / "scene" / "cameras.py"
     usual = "projection = getProjectionMatrix(znear, zfar, fovX, fovY"
-    source.write_text(f"{usual})\n")
+    source.write_text(f"{usual}).transpose(0, 1).cuda()\n")
     assert Vanilla3DGS().photographs(HostRepo(tmp_path), ["-s", "scene", "--eval"]).centred
-    source.write_text(f"{usual}, cx=cx)\n")
+    source.write_text(f"{usual}, cx=cx).transpose(0, 1).cuda()\n")
     assert not Vanilla3DGS().photographs(HostRepo(tmp_path), ["-s", "scene", "--eval"]).centred
 
 
