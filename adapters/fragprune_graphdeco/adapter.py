@@ -486,12 +486,14 @@ class GraphdecoAdapter(ScriptAdapter):
                 "views that are held out",
                 f"Train with {line.hold_out[-1]}, from stage 1 on.",
             )
+        source = Path(flags.source or "")
         return Photographs(
-            Path(flags.source or ""),
+            source,
             resolution(repo, flags.resolution),
             bool(flags.white_background),
             flags.images or "images",
             centred=_centred(repo),
+            opaque=_opaque(repo, source),
         )
 
     def not_drawn(self, repo: HostRepo, arguments: list[str]) -> list[str]:
@@ -546,6 +548,17 @@ def _centred(repo: HostRepo) -> bool:
     usual, calls = "getProjectionMatrix", every(repo.tree("scene.cameras"), ast.Call)
     made = [each for each in calls if getattr(each.func, "id", "").startswith(usual)]
     return all(text_of(c.func) == usual and len(c.args) + len(c.keywords) == 4 for c in made)
+
+
+def _opaque(repo: HostRepo, scene: Path) -> bool:
+    """Whether alpha channels are dropped: of COLMAP's images; of Blender's if loadCam opens them.
+
+    Readers of Blender's scenes composite images, but not those that loadCam opens once more.
+    """
+    tree = repo.tree(CAMERAS)
+    code = text_of(tree) if tree else ""
+    read = "Image.open(" in code or not (scene / "transforms_train.json").exists()
+    return read and "shape[0] == 4" not in code
 
 
 def group_names(function: Function | None) -> tuple[str, ...]:

@@ -180,7 +180,8 @@ class SimpleTrainer(Gsplat, ScriptAdapter):
             )
         factor = flags.get("data-factor", [str(self._fields()["data_factor"])])[0]
         images = "images" if factor == "1" else f"images_{factor}"
-        return Photographs(Path(flags["data-dir"][0]), images=images, centred=False)
+        folder = Path(flags["data-dir"][0])
+        return Photographs(folder, images=images, centred=False, opaque=True)
 
     def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any]:
         """Near plane, gsplat's cap on alpha, and the factor that ``--antialiased`` asks for.

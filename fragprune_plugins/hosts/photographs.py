@@ -9,8 +9,7 @@ from pathlib import Path
 from fragprune_plugins.constants import SIDE_MAX
 from fragprune_plugins.errors import InputError
 
-WIDEST = 1600
-"""Pixels: hosts shrink wider images to this width where no size is asked for (-r -1)."""
+WIDEST = 1600  # pixels; hosts shrink wider images to this width where no size is asked for (-r -1)
 
 
 @dataclass(frozen=True)
@@ -19,8 +18,7 @@ class Resolution:
 
     Attributes:
         divide: both sides are divided by this and rounded.
-        width: pixels. If given, images are scaled to this width instead of divided, and both sides
-            are cut down to whole pixels.
+        width: pixels. If given, images are scaled to it instead, to sides cut down to whole pixels.
         shrink_only: images narrower than ``width`` stay as they are.
     """
 
@@ -62,6 +60,7 @@ class Photographs:
         white_background: images with alpha are composited over white instead of black.
         images: name of the folder of a COLMAP scene that holds the images.
         centred: whether the principal point is a picture's middle, as in 3DGS; None if unknown.
+        opaque: the host drops alpha channels, as 3DGS does of a COLMAP scene.
     """
 
     folder: Path
@@ -69,3 +68,4 @@ class Photographs:
     white_background: bool = False
     images: str = "images"
     centred: bool | None = None
+    opaque: bool = False

@@ -232,7 +232,8 @@ def test_the_size_of_photographs_is_the_hosts(data, model, tmp_path, asked):
         tmp_path / "out", data, model, resolution=asked, white_background=True, images="images_8"
     )
     model_file = output / "point_cloud" / "iteration_900" / "point_cloud.ply"
-    assert trained_on(model_file) == Photographs(data, SIZES[asked], True, "images_8", centred=True)
+    how = {"centred": True, "opaque": not (data / "transforms_train.json").exists()}
+    assert trained_on(model_file) == Photographs(data, SIZES[asked], True, "images_8", **how)
 
 
 @pytest.mark.parametrize(

@@ -124,7 +124,7 @@ def test_without_its_arguments_photographs_are_read_as_the_command_says(
     assert result.exit_code == 0, result.stderr
     record = beside(tmp_path / "out/point_cloud/iteration_9/pruned.ply")
     read = recorded(record).photographs
-    how = {"white_background": True, "centred": True}
+    how = {"white_background": True, "centred": True, "opaque": True}
     assert read == Photographs(photographs, Resolution(divide=2), **how)
 
 

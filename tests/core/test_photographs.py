@@ -79,7 +79,8 @@ def test_another_way_of_choosing_the_size_is_refused(tmp_path, source):
 
 def test_folder_background_and_images_are_the_commands():
     read = command("-w", "--images", "images_4")
-    assert read == Photographs(Path("scene"), read.resolution, True, "images_4", centred=True)
+    how = {"centred": True, "opaque": True}
+    assert read == Photographs(Path("scene"), read.resolution, True, "images_4", **how)
     assert not command().white_background
 
 
@@ -92,6 +93,24 @@ def test_the_middle_is_the_principal_point_of_a_host_that_reads_no_other(tmp_pat
     assert Vanilla3DGS().photographs(HostRepo(tmp_path), ["-s", "scene", "--eval"]).centred
     source.write_text(f"{usual}, cx=cx).transpose(0, 1).cuda()\n")
     assert not Vanilla3DGS().photographs(HostRepo(tmp_path), ["-s", "scene", "--eval"]).centred
+
+
+@pytest.mark.parametrize(
+    ("load", "colmap", "blender"),
+    [
+        ("if resized_image_rgb.shape[1] == 4: loaded_mask = resized_image_rgb[3:4]", True, False),
+        ("image = Image.open(cam_info.image_path)", True, True),
+        ("if resized_image_rgb.shape[0] == 4: loaded_mask = resized_image_rgb[3:4]", False, False),
+    ],
+)
+def test_alpha_is_dropped_where_the_host_drops_it(tmp_path, load, colmap, blender):
+    shutil.copytree(HOST.root, tmp_path, dirs_exist_ok=True)
+    with (tmp_path / "utils" / "camera_utils.py").open("a") as source:
+        source.write(f"\n\ndef own(cam_info, resized_image_rgb):\n    {load}\n")
+    words = ["-s", str(tmp_path), "--eval"]
+    assert Vanilla3DGS().photographs(HostRepo(tmp_path), words).opaque == colmap
+    (tmp_path / "transforms_train.json").touch()
+    assert Vanilla3DGS().photographs(HostRepo(tmp_path), words).opaque == blender
 
 
 def test_a_command_that_holds_nothing_out_is_refused():

@@ -49,6 +49,13 @@ def test_alpha_is_composited_over_the_background(tmp_path, images):
         assert torch.equal(shot.view.background, torch.full((3,), float(white)))
 
 
+def test_hosts_of_3dgs_drop_the_alpha_of_colmaps_images(colmap):
+    picture = Image.new("RGBA", (tiny.SIDE, tiny.SIDE), (255, 128, 0, 51))
+    picture.save(colmap / "images" / "view01.png")
+    shot = load_dataset(colmap, opaque=True).train[0]
+    torch.testing.assert_close(shot.image[:, 0, 0], torch.tensor((1.0, 128 / 255, 0.0)))
+
+
 def test_resolution_scales_images_and_intrinsics(colmap):
     full, half = load_dataset(colmap), load_dataset(colmap, resolution=2)
     assert half.train[0].image.shape == (3, 16, 16)

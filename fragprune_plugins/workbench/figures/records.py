@@ -205,7 +205,8 @@ def recorded(record: Record) -> Recorded | None:
         scene, size = located(values["folder"], folder), Resolution(**values["resolution"])
         white, images = values["white_background"], values["images"]
         centred = None if values.get("centred") is None else bool(values["centred"])
-        photographs = Photographs(scene, size, white, images, centred)
+        how = centred, bool(values.get("opaque"))
+        photographs = Photographs(scene, size, white, images, *how)
         return Recorded(photographs, models, filtered, drawing)
 
 

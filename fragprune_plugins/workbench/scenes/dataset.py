@@ -22,6 +22,7 @@ from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.types import View, one_line
 from fragprune_plugins.workbench.scenes import colmap, transforms
 from fragprune_plugins.workbench.scenes.images import SUFFIXES, image_size, opened
+from fragprune_plugins.workbench.scenes.layouts import has_transforms
 from fragprune_plugins.workbench.scenes.lenses import Lens
 from fragprune_plugins.workbench.scenes.pinhole import Camera
 from fragprune_plugins.workbench.scenes.posed import Posed
@@ -129,12 +130,14 @@ class Photograph(Shot):
         camera: of the whole photograph, straightened; None if ``lens`` is.
         lens: what bends the photograph; None if it is straight.
         mask: an image of the same aspect. The photograph is black where this is.
+        opaque: an alpha channel counts for nothing; the colours stay as they are under it.
     """
 
     path: Path
     camera: Camera | None = None
     lens: Lens | None = None
     mask: Path | None = None
+    opaque: bool = False
     _pixels: PixelSlot = field(default_factory=PixelSlot, repr=False)
 
     __repr__ = one_line
@@ -167,7 +170,8 @@ class Photograph(Shot):
             whole = file.size
             mode = "RGBA" if file.has_transparency_data else "RGB"
             picture = self._fitted(file.convert(mode), size)
-        flat = _over(picture, 255 * self.view.background.cpu().numpy())
+        behind = 255 * self.view.background.cpu().numpy()
+        flat = picture[..., :3].copy() if self.opaque else _over(picture, behind)
         if self.mask is not None:
             with opened(self.mask) as file:
                 _expect_aspect(self.mask, file.size, "its photograph", whole)
@@ -263,6 +267,7 @@ def load_dataset(
     white_background: bool = False,
     images: str = "images",
     centred: bool | None = None,
+    opaque: bool = False,
 ) -> Dataset:
     """Read a COLMAP folder (sparse/, images/), or Blender's or nerfstudio's transforms files.
 
@@ -277,6 +282,7 @@ def load_dataset(
             Without ``images/``, the largest of ``images_2``, ``images_4`` and ``images_8`` serves.
         centred: render as if each principal point was the middle of its picture, as 3DGS does. None
             does not, but warns where it makes a difference.
+        opaque: drop alpha channels, as 3DGS does of a COLMAP folder's images.
 
     Raises:
         DatasetError: the folder has neither layout or both, an image is missing, a camera model is
@@ -291,11 +297,11 @@ def load_dataset(
             found, expected = f"the photograph of {views} views", "a photograph for each view"
             remedy = "Keep the sub-folders that the scene names below its folder of images."
             raise DatasetError(str(path), found, expected, remedy)
-    train, test = ([make_shot(row, background, size) for row in part] for part in rows)
+    train, test = ([make_shot(row, background, size, opaque) for row in part] for part in rows)
     dataset = Dataset(train, test).aimed(bool(centred))
     straight = all(row.lens is None for part in rows for row in part)
     off = dataset.off_centre if straight and centred is None else 0
-    if off > OFF_CENTRE and not transforms.has_transforms(Path(folder)):
+    if off > OFF_CENTRE and not has_transforms(Path(folder)):
         log.warning(
             "%s: the principal point is up to %.1f pixels off the middle, which 3DGS and most of "
             "its descendants ignore: figures of their models are wrong, unless these lie in their "
@@ -321,14 +327,14 @@ def read_scene(folder: Path, images: str = "images") -> tuple[list[Posed], list[
         expected = "a folder with photographs"
         raise DatasetError(str(folder), "no such folder", expected, "Check --data.")
     model = colmap.find_model(folder)
-    has_transforms = transforms.has_transforms(folder)
-    if model is not None and has_transforms and model != folder / colmap.NERFSTUDIOS:
+    known = has_transforms(folder)
+    if model is not None and known and model != folder / colmap.NERFSTUDIOS:
         found = "both COLMAP's and a transforms layout"
         raise DatasetError(str(folder), found, _LAYOUTS, "Move one aside.")
-    if model is None and not has_transforms:
+    if model is None and not known:
         raise DatasetError(str(folder), "neither layout", _LAYOUTS, _where_else(folder))
     images = _image_folder(folder, images)
-    train, test = (transforms if has_transforms else colmap).read(folder, images)
+    train, test = (transforms if known else colmap).read(folder, images)
     for name, part in (("training", train), ("held-out", test)):
         if not part:
             raise DatasetError(
@@ -343,7 +349,7 @@ def read_scene(folder: Path, images: str = "images") -> tuple[list[Posed], list[
 def _where_else(folder: Path) -> str:
     """What to do about a folder that is no scene."""
     for other in (folder.parent, *sorted(each for each in folder.iterdir() if each.is_dir())):
-        if colmap.find_model(other) is not None or transforms.has_transforms(other):
+        if colmap.find_model(other) is not None or has_transforms(other):
             return f"Pass {other}."
     if any(each.suffix.lower() in SUFFIXES for each in folder.iterdir()):
         return "These images have no cameras; run COLMAP on them first."
@@ -361,13 +367,15 @@ def _image_folder(folder: Path, images: str) -> str:
     return images
 
 
-def make_shot(row: Posed, background: Tensor, resolution: Resolution) -> Photograph:
+def make_shot(
+    row: Posed, background: Tensor, resolution: Resolution, opaque: bool = False
+) -> Photograph:
     """Pair an image file with its camera. This reads only the file's header."""
     width, height = image_size(row.image)
     camera = row.camera
     _expect_aspect(row.image, (width, height), "its camera", (camera.width, camera.height))
     view = camera.resized(*resolution.of(width, height)).view(background)
-    return Photograph(row.name, view, row.image, camera, row.lens, row.mask)
+    return Photograph(row.name, view, row.image, camera, row.lens, row.mask, opaque)
 
 
 def _expect_aspect(

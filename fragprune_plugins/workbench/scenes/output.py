@@ -18,6 +18,7 @@ from fragprune_plugins.errors import DatasetError, ModelFileError, printable
 from fragprune_plugins.files.reading import MEBIBYTE, UntrustedFile
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.hosts.source import parsed
+from fragprune_plugins.workbench.scenes.layouts import has_transforms
 
 ARGUMENTS, CAMERAS = "cfg_args", "cameras.json"
 
@@ -116,12 +117,14 @@ def _arguments(model: Path) -> tuple[Photographs, bool] | None:
 
 def told_by(values: Mapping[str, Any]) -> Photographs:
     """The photographs that the arguments of a 3DGS host name, by their names there."""
+    source = Path(str(values["source_path"]))
     return Photographs(
-        Path(str(values["source_path"])),
+        source,
         Resolution.asked(int(values.get("resolution", -1)), _DIVISORS),
         bool(values.get("white_background", False)),
         str(values.get("images", "images")),
         centred=True,
+        opaque=not has_transforms(source),
     )
 
 
