@@ -236,6 +236,15 @@ def test_the_size_of_photographs_is_the_hosts(data, model, tmp_path, asked):
     assert trained_on(model_file) == Photographs(data, SIZES[asked], True, "images_8", **how)
 
 
+@pytest.mark.parametrize(("known", "opaque"), [({}, False), ({"train_test_exp": False}, True)])
+def test_3dgs_since_october_2024_drops_the_alpha_of_blenders_images(model, tmp_path, known, opaque):
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "transforms_train.json").touch()
+    output = tiny.host_output(tmp_path / "out", tmp_path / "scene", model, **known)
+    read = trained_on(output / "point_cloud" / "iteration_900" / "point_cloud.ply")
+    assert read.opaque == opaque
+
+
 @pytest.mark.parametrize(
     "text",
     [

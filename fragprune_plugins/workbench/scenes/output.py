@@ -23,6 +23,9 @@ from fragprune_plugins.workbench.scenes.layouts import has_transforms
 ARGUMENTS, CAMERAS = "cfg_args", "cameras.json"
 
 _DIVISORS = (1, 2, 4, 8)  # of -r; other numbers are widths
+_LATE = "train_test_exp"
+"""An argument of 3DGS since October 2024, which drops the alpha of Blender's images, too."""
+_READ = ("source_path", "images", "resolution", "white_background", "eval", _LATE)
 
 _FILE = UntrustedFile(
     DatasetError,
@@ -108,7 +111,7 @@ def _arguments(model: Path) -> tuple[Photographs, bool] | None:
         call = _call(reading.text())
         values: dict[str, Any] = {}
         for word in call.keywords:
-            if word.arg in ("source_path", "images", "resolution", "white_background", "eval"):
+            if word.arg in _READ:
                 reading.place = word.arg
                 values[word.arg] = ast.literal_eval(word.value)
         reading.place = ""
@@ -124,7 +127,7 @@ def told_by(values: Mapping[str, Any]) -> Photographs:
         bool(values.get("white_background", False)),
         str(values.get("images", "images")),
         centred=True,
-        opaque=not has_transforms(source),
+        opaque=_LATE in values or not has_transforms(source),
     )
 
 
