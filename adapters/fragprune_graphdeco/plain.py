@@ -25,6 +25,7 @@ from fragprune_graphdeco.reading import (
     decided,
     defaults,
     every,
+    first_of,
     made_models,
     passed,
     returns,
@@ -452,8 +453,7 @@ def _shown(function: ast.AST) -> list[ast.AST]:
     """The code that makes what a function returns as ``render``."""
     made: dict[str, list[ast.expr]] = {}
     for target, value in assigned(function):
-        first = target.elts[0] if isinstance(target, ast.Tuple) else target
-        made.setdefault(getattr(first, "id", ""), []).append(value)
+        made.setdefault(getattr(first_of(target), "id", ""), []).append(value)
     found: list[ast.AST] = [*pictures(function)]
     for each in found:  # it grows
         if isinstance(each, ast.Name):
@@ -615,11 +615,8 @@ class Drawing:
                 if isinstance(node, ast.Name) and node.id not in seen:
                     seen.add(node.id)
                     waiting += self.values.get(node.id, [])
-                elif isinstance(node, ast.Subscript) and own in self._roots(node.value):
-                    index = node.slice
-                    first = index.elts[0] if isinstance(index, ast.Tuple) and index.elts else index
-                    if not isinstance(first, ast.Slice | ast.Constant):
-                        return text_of(node)[:60]
+                elif (of := reading.chosen(node)) and own in self._roots(of):
+                    return text_of(node)[:60]
         return ""
 
     def reasons(self) -> Iterator[tuple[str, bool]]:
@@ -686,8 +683,7 @@ class Drawing:
             if getattr(value, "id", "") in kept and isinstance(target, ast.Tuple):
                 kept |= {getattr(target.elts[0], "id", "")}
         given = [node.value for node in every(function, ast.Return)]
-        first = [each.elts[0] if isinstance(each, ast.Tuple) else each for each in given]
-        return bool(first) and all(getattr(each, "id", "") in kept for each in first)
+        return bool(given) and all(getattr(first_of(each), "id", "") in kept for each in given)
 
     def inputs(self) -> Iterator[tuple[str, bool]]:
         """Inputs of its call that a plain drawing does not have, and whether arguments of
@@ -751,7 +747,7 @@ class Drawing:
     def cuts(self) -> Iterator[ast.expr]:
         """What takes channels out of the picture that the rasterizer returns."""
         whole = {
-            getattr(target.elts[0] if isinstance(target, ast.Tuple) else target, "id", "")
+            getattr(first_of(target), "id", "")
             for target, value in assigned(self.function)
             if value is self.call
         } - {""}
@@ -761,8 +757,7 @@ class Drawing:
                 while isinstance(inner, ast.Subscript):
                     inner = inner.value
             elif isinstance(node, ast.Subscript):
-                index, inner = node.slice, node.value
-                first = index.elts[0] if isinstance(index, ast.Tuple) and index.elts else index
+                first, inner = first_of(node.slice), node.value
                 if not isinstance(first, ast.Slice) or not (first.lower or first.upper):
                     continue
             else:

@@ -121,6 +121,18 @@ def assigned(tree: ast.AST | None) -> list[tuple[ast.expr, ast.expr]]:
     return [*(each for each in pairs if each not in several), *singles]
 
 
+def first_of(node: ast.AST | None) -> ast.AST | None:
+    """The first part of a tuple; other code as it is."""
+    return node.elts[0] if isinstance(node, ast.Tuple) and node.elts else node
+
+
+def chosen(node: ast.AST) -> ast.expr | None:
+    """What code takes rows of by a mask or by indices, as ``xyz[mask]`` of ``xyz``; else None."""
+    if not isinstance(node, ast.Subscript):
+        return None
+    return None if isinstance(first_of(node.slice), ast.Slice | ast.Constant) else node.value
+
+
 def entries(tree: ast.AST | None, name: str) -> list[ast.expr]:
     """What dicts have under a name."""
     dicts = every(tree, ast.Dict)
@@ -196,8 +208,7 @@ def _left_out(repo: HostRepo, scripts: Iterable[str]) -> Iterator[str]:
     off = off_by_default(save) - named if save else set()
     gone = skipped(save, lambda node: [None] if getattr(node, "id", "") in off else [])
     for each in every(save, ast.Subscript):
-        chosen = not isinstance(each.slice, ast.Slice | ast.Tuple | ast.Constant)
-        if chosen and each not in gone and _ROWS.fullmatch(text_of(each.value)):
+        if each not in gone and (of := chosen(each)) and _ROWS.fullmatch(text_of(of)):
             yield f"save_ply leaves out rows, {text_of(each)} ({repo.at(MODEL, each.lineno)})"
 
 

@@ -955,6 +955,11 @@ LEFT_OUT = {
     ),
     "in place": (CHOSEN, "gaussians.save_ply(path, bright)", True),
     "always": (SAVED.replace("...", "write(path, self._xyz[self.kept])"), "scene.save(9)", True),
+    "of whole rows": (
+        SAVED.replace("...", "write(path, self._xyz[self.kept, :])"),
+        "scene.save(9)",
+        True,
+    ),
     "where nobody names them": (CHOSEN, "gaussians.save_ply(path)", False),
     "where they are None": (CHOSEN, "gaussians.save_ply(path, kept=None)", False),
     "not at all": (SAVED.replace("...", "write(path, self._xyz[:, 0])"), "scene.save(9)", False),
