@@ -492,7 +492,7 @@ class GraphdecoAdapter(ScriptAdapter):
             resolution(repo, flags.resolution),
             bool(flags.white_background),
             flags.images or "images",
-            centred=_centred(repo),
+            centred=_centred(repo) or None,
             opaque=_opaque(repo, source),
         )
 

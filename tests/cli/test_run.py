@@ -183,6 +183,20 @@ def test_views_that_stage_one_saw_are_not_said_to_be_held_out(scene, tmp_path, h
     assert (" held out" in run_json("report", out)["result"]) == held
 
 
+def test_where_the_code_leaves_it_open_the_model_says_which_principal_point_it_has(tmp_path, scene):
+    """A host reads the scene's own point by an option: without it, it takes the middle."""
+    scene, host = shutil.copytree(scene, tmp_path / "scene"), tmp_path / "host"
+    cameras = scene / "sparse" / "0" / "cameras.txt"
+    number, kind, width, height, fx, fy, *_ = cameras.read_text().splitlines()[-1].split()
+    lens = number, kind, width, height, fx, fy, str(0.6 * int(width)), str(0.4 * int(height))
+    cameras.write_text(" ".join(lens))
+    with (shutil.copytree(HOST, host) / "scene" / "cameras.py").open("a") as source:
+        source.write("\n\ndef own(c):\n    getProjectionMatrix(1, 9, c.FoVx, c.FoVy, cx=c.cx)\n")
+    words = [host / "train.py", *command(scene, tmp_path / "out")[2:]]
+    assert ran(*WORDS, "--", *words)["after"]
+    assert records.recorded(records.find(tmp_path / "out")[-1]).photographs.centred
+
+
 def test_a_finished_stage_two_says_so_and_runs_nothing(folder):
     (out, words), finetune = folder, ["--stage", "finetune", *WORDS]
     result = models(out)[1]

@@ -127,14 +127,14 @@ def _open(asked: Asked) -> _Opened:
         if asked.shard:
             dataset = load_photographs(photographs)
         else:
-            photographs, dataset = _aimed(whole, photographs, engine)
+            photographs, dataset = aimed(whole, photographs, engine)
     checkpoints = Checkpoints(resuming.path_beside(asked.out), resuming.EVERY, tell=_say)
     configuration = resuming.configuration(whole, dataset, settings, engine.name)
     configuration |= {"keep": asked.keep} | ({"sharded": True} if asked.shard else {})
     return _Opened(asked, whole, photographs, dataset, engine, device, checkpoints, configuration)
 
 
-def _aimed(model: Model, read: Photographs, engine: Engine) -> tuple[Photographs, Dataset]:
+def aimed(model: Model, read: Photographs, engine: Engine) -> tuple[Photographs, Dataset]:
     """Photographs around the middle, or the scene's own principal point: as the model shows them.
 
     3DGS and most of its descendants take the middle, whatever the scene says; others do not.

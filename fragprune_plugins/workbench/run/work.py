@@ -39,6 +39,7 @@ from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.figures import records, wording
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
 from fragprune_plugins.workbench.finetune.trial import Trial, tried
+from fragprune_plugins.workbench.finetune.work import aimed
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.pruning import kept
 from fragprune_plugins.workbench.run.afterwards import Unserved, train_then_finetune, unserved
@@ -98,6 +99,7 @@ def run(
         if photographs:
             try:
                 with current_gpu(engine.device), _enough_memory():
+                    photographs = _settled(photographs, engine)
                     *first, after = measure_models(photographs, engine)
                     before = first[0] if first else None
             except FragpruneError as error:  # the trained model is saved already
@@ -218,10 +220,27 @@ def photographs_of(summary: launch.RunSummary) -> records.Recorded | None:
     return records.Recorded(summary.photographs, left, filtered=True, drawing=summary.drawing)
 
 
+def _opened(engine: EngineOptions) -> tuple[Engine, torch.device]:
+    """An engine on the host's device, if one can draw there."""
+    return open_engine(EngineOptions(engine.name, "cpu" if engine.device == "cpu" else "auto"))
+
+
+def _settled(read: records.Recorded, engine: EngineOptions) -> records.Recorded:
+    """The same, with the principal point by which its first model shows its photographs.
+
+    A host whose code does not always take the middle may read another by an option alone.
+    """
+    if read.photographs.centred is not None:
+        return read
+    rasterizer, where = _opened(engine)
+    model = load(read.models[0], filtered=read.filtered, device=where)
+    host = _AsTheHost(rasterizer.name, rasterizer, read.drawing)
+    return replace(read, photographs=aimed(model, read.photographs, host)[0])
+
+
 def measure_models(read: records.Recorded, engine: EngineOptions) -> list[dict[str, Any]]:
-    """Measure the models on held-out views, on the host's device if an engine can draw there."""
-    device = "cpu" if engine.device == "cpu" else "auto"
-    rasterizer, where = open_engine(EngineOptions(engine.name, device))
+    """Measure the models on held-out views."""
+    rasterizer, where = _opened(engine)
     dataset = load_photographs(read.photographs)
     models = [load(path, filtered=read.filtered, device=where) for path in read.models]
     candidates = [Candidate(model, read.drawing) for model in models]
@@ -318,7 +337,8 @@ class Looking:
         rasterizer, device = open_engine(self.engine)
         engine = _AsTheHost(rasterizer.name, rasterizer, drawing)
         model = load(ply, filtered=True, device=device)
-        dataset = load_photographs(photographs).to(device)
+        read = records.Recorded(photographs, (ply,), filtered=True, drawing=drawing)
+        dataset = load_photographs(_settled(read, self.engine).photographs).to(device)
         self.seen |= saw_held_out(ply, dataset)
         trial, left = tried(model, dataset, settings, engine=engine, say=log.info), None
         if trial.keep is not None:
