@@ -242,6 +242,14 @@ def test_what_only_an_adapter_can_do_is_refused(more, host, photographs, tmp_pat
     assert not (tmp_path / "out").exists()
 
 
+def test_several_processes_are_refused_before_the_training(
+    host, photographs, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    fails("run", *WORDS, *host(photographs), says="several processes")
+    assert not (tmp_path / "out").exists()
+
+
 def test_photographs_that_we_cannot_read_are_said_before_the_training(host, tmp_path):
     fails("run", *WORDS, *host(tmp_path / "nothing"), says="[dataset]", code=1)
     assert not (tmp_path / "out").exists()

@@ -24,6 +24,7 @@ from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
 from fragprune_plugins.workbench.finetune.work import finetune
+from fragprune_plugins.workbench.ranks import launched
 from fragprune_plugins.workbench.saved import models_of
 from fragprune_plugins.workbench.scenes.dataset import read_scene
 from fragprune_plugins.workbench.scenes.output import cameras_of, told_by, trained_on
@@ -137,8 +138,12 @@ def train_then_finetune(
     Raises:
         DatasetError: we cannot read its photographs.
         HostFailed: it ended with an error code, or left no model.
-        UsageError: a control, of a model that learns from its own pictures.
+        UsageError: a control of a model that learns from its own pictures, or several processes.
     """
+    if launched().several:
+        raise UsageError(
+            "run", "several processes", "one, for a codebase that no adapter fits", _BY_HAND
+        )
     settings = _settings_of(host.unlike, settings)
     log.info("no adapter fits (%s), but its PLY is plain 3DGS", host.why)
     photographs, since = host.photographs, 0.0
@@ -155,15 +160,8 @@ def train_then_finetune(
     if not host.unlike and (name := exposed(model)):
         settings = _settings_of(f"it learned an exposure for {name}", settings)
     out = model.with_name("pruned.ply" if settings.goal.presses else "control.ply")
-    with contextlib.suppress(DatasetError):  # what it wrote as its arguments may be anything
-        photographs = trained_on(model) or photographs
     log.info("%s learns by vanilla 3DGS's drawing and loss, as in fragprune finetune", model)
-    scene = SceneOptions()
-    if photographs is not None:
-        data = None if settings.itself and cameras_of(model) else photographs.folder
-        scene = SceneOptions(data, white_background=photographs.white_background)
-        if not settings.itself:
-            log.info("from the photographs in %s", data)
+    photographs, scene = _scene_of(model, photographs, settings)
     report = finetune(
         model=model,
         out=out,
@@ -179,6 +177,20 @@ def train_then_finetune(
     assert report is not None
     host_data = {"stage": stage, "model_before": str(model), "model_after": str(out)}
     return replace(report, data=report.data | host_data)
+
+
+def _scene_of(
+    model: Path, photographs: Photographs | None, settings: Settings
+) -> tuple[Photographs | None, SceneOptions]:
+    """The photographs of a model's training, by what it wrote or else these, and its cameras."""
+    with contextlib.suppress(DatasetError):  # what it wrote as its arguments may be anything
+        photographs = trained_on(model) or photographs
+    if photographs is None:
+        return None, SceneOptions()
+    data = None if settings.itself and cameras_of(model) else photographs.folder
+    if not settings.itself:
+        log.info("from the photographs in %s", data)
+    return photographs, SceneOptions(data, white_background=photographs.white_background)
 
 
 def _settings_of(unlike: str, settings: Settings) -> Settings:
