@@ -22,7 +22,6 @@ from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.types import View, one_line
 from fragprune_plugins.workbench.scenes import colmap, transforms
 from fragprune_plugins.workbench.scenes.images import SUFFIXES, image_size, opened
-from fragprune_plugins.workbench.scenes.layouts import has_transforms
 from fragprune_plugins.workbench.scenes.lenses import Lens
 from fragprune_plugins.workbench.scenes.pinhole import Camera
 from fragprune_plugins.workbench.scenes.posed import Posed
@@ -301,7 +300,7 @@ def load_dataset(
     dataset = Dataset(train, test).aimed(bool(centred))
     straight = all(row.lens is None for part in rows for row in part)
     off = dataset.off_centre if straight and centred is None else 0
-    if off > OFF_CENTRE and not has_transforms(Path(folder)):
+    if off > OFF_CENTRE and not transforms.has_transforms(Path(folder)):
         log.warning(
             "%s: the principal point is up to %.1f pixels off the middle, which 3DGS and most of "
             "its descendants ignore: figures of their models are wrong, unless these lie in their "
@@ -327,7 +326,7 @@ def read_scene(folder: Path, images: str = "images") -> tuple[list[Posed], list[
         expected = "a folder with photographs"
         raise DatasetError(str(folder), "no such folder", expected, "Check --data.")
     model = colmap.find_model(folder)
-    known = has_transforms(folder)
+    known = transforms.has_transforms(folder)
     if model is not None and known and model != folder / colmap.NERFSTUDIOS:
         found = "both COLMAP's and a transforms layout"
         raise DatasetError(str(folder), found, _LAYOUTS, "Move one aside.")
@@ -349,7 +348,7 @@ def read_scene(folder: Path, images: str = "images") -> tuple[list[Posed], list[
 def _where_else(folder: Path) -> str:
     """What to do about a folder that is no scene."""
     for other in (folder.parent, *sorted(each for each in folder.iterdir() if each.is_dir())):
-        if colmap.find_model(other) is not None or has_transforms(other):
+        if colmap.find_model(other) is not None or transforms.has_transforms(other):
             return f"Pass {other}."
     if any(each.suffix.lower() in SUFFIXES for each in folder.iterdir()):
         return "These images have no cameras; run COLMAP on them first."

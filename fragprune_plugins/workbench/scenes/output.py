@@ -18,7 +18,6 @@ from fragprune_plugins.errors import DatasetError, ModelFileError, printable
 from fragprune_plugins.files.reading import MEBIBYTE, UntrustedFile
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.hosts.source import parsed
-from fragprune_plugins.workbench.scenes.layouts import has_transforms
 
 ARGUMENTS, CAMERAS = "cfg_args", "cameras.json"
 
@@ -127,7 +126,7 @@ def told_by(values: Mapping[str, Any]) -> Photographs:
         bool(values.get("white_background", False)),
         str(values.get("images", "images")),
         centred=True,
-        opaque=_LATE in values or not has_transforms(source),
+        opaque=_LATE in values or not (source / "transforms_train.json").exists(),
     )
 
 

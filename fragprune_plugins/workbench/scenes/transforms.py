@@ -12,9 +12,11 @@ import torch
 from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.files.reading import MEBIBYTE, UntrustedFile
 from fragprune_plugins.workbench.scenes.images import find_image, image_size
-from fragprune_plugins.workbench.scenes.layouts import PAIR, SINGLE
 from fragprune_plugins.workbench.scenes.lenses import Lens
 from fragprune_plugins.workbench.scenes.posed import Posed, split
+
+PAIR = ("transforms_train.json", "transforms_test.json")
+SINGLE = "transforms.json"
 
 _PINHOLES = ("", "PINHOLE", "SIMPLE_PINHOLE")
 _BENT = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE")
@@ -34,6 +36,11 @@ _TRANSFORMS = UntrustedFile(
     "frames with file_path and transform_matrix, and camera_angle_x or fl_x",
     "Export it again.",
 )
+
+
+def has_transforms(folder: Path) -> bool:
+    """Whether a folder has one of the two layouts."""
+    return (folder / PAIR[0]).exists() or (folder / SINGLE).exists()
 
 
 def read(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]]:
