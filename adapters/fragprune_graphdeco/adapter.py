@@ -502,8 +502,9 @@ class GraphdecoAdapter(ScriptAdapter):
         projection = repo.function("utils.graphics_utils", "getProjectionMatrix")
         pinhole = projection is None or "[3, 2]" in text_of(projection)
         other = [] if pinhole else ["its getProjectionMatrix, which is no pinhole camera's"]
-        why = photographs.unlike(repo, map(reading.module_of, self.scripts_of(repo)))
-        other += [why] * (why not in ("", photographs.NOT_FOUND))
+        if not self.installed:  # whose folder holds all other packages
+            why = photographs.unlike(repo, map(reading.module_of, self.scripts_of(repo)))
+            other += [why] * (why not in ("", photographs.NOT_FOUND))
         return [f"{flag}, which our readers do not support" for flag in flags] + other
 
     def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from fragprune_gaussian_splatting import GaussianSplatting
+from fragprune_graphdeco import photographs as reading_of_photographs
 from fragprune_plugins.adapting import HostRepo, SessionError, read_ply
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.hosts.choosing import attempt
@@ -117,3 +118,10 @@ def test_a_script_of_ones_own_runs_with_the_package_answered(tmp_path):
     )
     summary = run(["python", str(script)], RunOptions(device="cpu"))
     assert (summary.adapter, summary.steps) == ("gaussian-splatting", 0)
+
+
+def test_an_installed_host_is_not_read_with_all_that_is_installed_beside_it(monkeypatch):
+    """Its imports lead to torch: 12 GB of syntax trees."""
+    monkeypatch.setattr(reading_of_photographs, "unlike", None)
+    adapter = GaussianSplatting()
+    assert adapter.not_drawn(HostRepo.installed(adapter.installed[0]), []) == []
