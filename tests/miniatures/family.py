@@ -18,7 +18,7 @@ PARSE = "    args = parser.parse_args()\n"
 BACKWARD = "        loss.backward()\n"
 STEP = "            if iteration < opt.iterations:\n"
 RADII = '        "radii": radii,\n'
-NEW_ROWS = "        new_rotation,\n    ):\n"
+NEW_ROWS = "new_scaling, new_rotation\n    ):\n"
 ANEW = """        self._reset_statistics()
         self.max_radii2D = torch.zeros(self.get_xyz.shape[0], device="cuda")
 """

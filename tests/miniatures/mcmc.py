@@ -126,7 +126,7 @@ class MCMCHost(Descendant):
                 "from utils.sh_utils import RGB2SH\n",
                 before="from utils.reloc_utils import compute_relocation_cuda\n",
             ),
-            (NEW_ROWS, NEW_ROWS.replace("    ):", "        reset_params=True,\n    ):")),
+            (NEW_ROWS, NEW_ROWS.replace("\n    ):", ",\n        reset_params=True,\n    ):")),
             (ANEW, f"        if reset_params:\n{indent(ANEW, ' ' * 4)}"),
         ],
         TRAIN: [
