@@ -44,10 +44,8 @@ def _of_script(repo: HostRepo, script: str) -> Iterator[str]:
     for module, tree in reading.reached(repo, [script]).items():
         for function in reading.learning(tree):
             learns, gone = True, reading.skipped(function, known)
-            for node, sides in _compared(function):
+            for node, sides in (pair for pair in _compared(function) if pair[0] not in gone):
                 kinds = [_kinds(function, each, gone) for each in sides]
-                if node in gone:
-                    continue
                 if sorted(map(sorted, kinds)) == [["drawn"], ["photograph"]]:
                     why = ""
                 elif {"drawn", "photograph"} <= set.union(*kinds):

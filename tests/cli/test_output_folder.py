@@ -13,6 +13,7 @@ import fragprune_plugins as fp
 from fragprune_plugins import RasterInputs
 from fragprune_plugins.errors import DatasetError, ModelFileError
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
+from fragprune_plugins.workbench.finetune import work
 from fragprune_plugins.workbench.models.formats.ply import write_ply
 from fragprune_plugins.workbench.scenes.dataset import load_dataset
 from fragprune_plugins.workbench.scenes.output import newest_model, trained_on
@@ -185,6 +186,16 @@ def test_a_training_that_held_other_views_out_has_seen_ours(
     words = ("--out", tmp_path / "r.ply", "--iters", 2, "--train", "opacity")
     assert run_json("finetune", listed(held, of=of), *words)["seen"] is seen
     assert ("held out other views, of" in caplog.text) is seen
+
+
+def test_it_is_warned_of_before_the_learning(listed, tmp_path, monkeypatch, caplog):
+    def learned(*_):
+        assert "held out other views, of" in caplog.text
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(work, "_learned", learned)
+    words = ("--out", tmp_path / "r.ply", "--iters", 2, "--train", "opacity")
+    assert run("finetune", listed((3, 4)), *words).exit_code == 130
 
 
 @pytest.mark.parametrize(("at", "said"), [(0.0, False), (1e-5, False), (0.5, True)])

@@ -132,22 +132,26 @@ BELOW = "/coded/name/point_cloud/iteration_1"
 COPIES = f"out + '/point_cloud/iteration_9', out + {BELOW!r}, copy_function=shutil.copy"
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "place"),
-    [  # Self-Organizing-Gaussians compresses its model, and writes what comes out again
-        ("\nprint(", f"\nshutil.copytree({COPIES})\nprint(", "out"),
-        ("= sys.argv[2], sys.argv[4]", "= sys.argv[2], 'own'", "own"),
-    ],
-    ids=["made of it, in a folder below", "in a folder that it chooses"],
-)
-def test_the_model_is_what_was_trained(host, photographs, tmp_path, monkeypatch, old, new, place):
+def test_what_a_host_makes_of_its_model_in_a_folder_below_is_not_taken(host, photographs, tmp_path):
+    """Self-Organizing-Gaussians compresses it, and writes what comes out again."""
     words = host(photographs)
     script = words[2]
-    script.write_text(script.read_text().replace(old, new))
-    monkeypatch.chdir(tmp_path)
+    text = script.read_text().replace("\nprint(", f"\nshutil.copytree({COPIES})\nprint(")
+    script.write_text(text)
     data = json.loads(run("run", "--json", *WORDS, *words).stdout)
-    assert (tmp_path / f"out{BELOW}/point_cloud.ply").exists() == (place == "out")
-    assert data["model_before"] == str(tmp_path / place / "point_cloud/iteration_9/point_cloud.ply")
+    assert (tmp_path / f"out{BELOW}/point_cloud.ply").exists()
+    assert data["model_before"] == str(tmp_path / "out/point_cloud/iteration_9/point_cloud.ply")
+
+
+def test_a_model_in_another_folder_may_be_another_trainings(
+    host, photographs, tmp_path, monkeypatch
+):
+    words = host(photographs)
+    script = words[2]
+    script.write_text(script.read_text().replace("sys.argv[2], sys.argv[4]", "sys.argv[2], 'own'"))
+    monkeypatch.chdir(tmp_path)
+    fails("run", *WORDS, *words, says=("no point_cloud.ply in", "fragprune finetune"), code=1)
+    assert not list(tmp_path.rglob("pruned.ply"))
 
 
 def test_a_script_in_a_folder_of_its_codebase_is_served(host, photographs, tmp_path):

@@ -62,6 +62,7 @@ class _Opened:
         photographs: where they lie; None for the model's own pictures.
         dataset: the photographs or pictures.
         configuration: what decides the result; a command of the same one is known again.
+        seen: the training before saw views that are held out here.
     """
 
     asked: Asked
@@ -72,6 +73,7 @@ class _Opened:
     device: Any
     checkpoints: Checkpoints
     configuration: dict[str, Any]
+    seen: bool
 
 
 def finetune(**options: Any) -> Report | None:
@@ -131,7 +133,10 @@ def _open(asked: Asked) -> _Opened:
     checkpoints = Checkpoints(resuming.path_beside(asked.out), resuming.EVERY, tell=_say)
     configuration = resuming.configuration(whole, dataset, settings, engine.name)
     configuration |= {"keep": asked.keep} | ({"sharded": True} if asked.shard else {})
-    return _Opened(asked, whole, photographs, dataset, engine, device, checkpoints, configuration)
+    seen = not asked.itself and saw_held_out(asked.model, dataset)
+    return _Opened(
+        asked, whole, photographs, dataset, engine, device, checkpoints, configuration, seen
+    )
 
 
 def aimed(model: Model, read: Photographs, engine: Engine) -> tuple[Photographs, Dataset]:
@@ -216,7 +221,7 @@ def _learned(opened: _Opened, ranks: Ranks, lost: float | None) -> tuple[Finetun
         forgotten=lost,
         found=found,
         truncated=ranks.gather(saved.falloff is not None)[0],
-        seen=not asked.itself and saw_held_out(asked.model, opened.dataset),
+        seen=opened.seen,
         shards=ranks.size if asked.shard else 1,
     )
     return over, engine

@@ -32,7 +32,6 @@ from fragprune_plugins.workbench.scenes.training import exposed
 
 log = logging.getLogger("fragprune")
 
-_SAVED = "point_cloud.ply"
 _BY_HAND = "fragprune finetune MODEL.ply --data SCENE --out pruned.ply learns on any that is there."
 
 
@@ -78,18 +77,17 @@ class Unserved:
     def saved(self, since: float) -> Path:
         """The PLY that it wrote last, since a time; what it makes of one lies in folders below it.
 
-        A training that chooses its folder by itself is expected to do so below the working one.
+        Another folder than the one that it names may be another training's.
 
         Raises:
             HostFailed: there is none.
         """
         folder = self.output or Path.cwd()
-        for place in (folder, Path.cwd()) if since else (folder,):
-            found = [each for each in place.rglob(_SAVED) if each.stat().st_mtime >= since]
-            if found:
-                return max(found, key=lambda each: (-len(each.parts), each.stat().st_mtime))
-        what = f"no {_SAVED} in {folder}" + (" since it began" if since else "")
-        raise HostFailed(self.program[-1], what, "the model that it trained", _BY_HAND)
+        found = [each for each in folder.rglob("point_cloud.ply") if each.stat().st_mtime >= since]
+        if not found:
+            what = f"no point_cloud.ply in {folder}" + (" since it began" if since else "")
+            raise HostFailed(self.program[-1], what, "the model that it trained", _BY_HAND)
+        return max(found, key=lambda each: (-len(each.parts), each.stat().st_mtime))
 
 
 def unserved(command: Sequence[str]) -> Unserved | None:

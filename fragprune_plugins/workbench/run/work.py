@@ -337,8 +337,9 @@ class Looking:
         rasterizer, device = open_engine(self.engine)
         engine = _AsTheHost(rasterizer.name, rasterizer, drawing)
         model = load(ply, filtered=True, device=device)
-        read = records.Recorded(photographs, (ply,), filtered=True, drawing=drawing)
-        dataset = load_photographs(_settled(read, self.engine).photographs).to(device)
+        if photographs.centred is None:  # as _settled asks
+            photographs, _ = aimed(model, photographs, engine)
+        dataset = load_photographs(photographs).to(device)
         self.seen |= saw_held_out(ply, dataset)
         trial, left = tried(model, dataset, settings, engine=engine, say=log.info), None
         if trial.keep is not None:

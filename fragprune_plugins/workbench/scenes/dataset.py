@@ -297,7 +297,7 @@ def load_dataset(
             remedy = "Keep the sub-folders that the scene names below its folder of images."
             raise DatasetError(str(path), found, expected, remedy)
     train, test = ([make_shot(row, background, size, opaque) for row in part] for part in rows)
-    dataset = Dataset(train, test).aimed(bool(centred))
+    dataset = Dataset(train, test).aimed(True) if centred else Dataset(train, test)
     straight = all(row.lens is None for part in rows for row in part)
     off = dataset.off_centre if straight and centred is None else 0
     if off > OFF_CENTRE and not transforms.has_transforms(Path(folder)):
