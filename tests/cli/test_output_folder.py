@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from cli.commands import fails, run, run_json
@@ -87,6 +88,31 @@ def test_a_model_is_fine_tuned_around_the_point_by_which_it_shows_its_photograph
     where = "the middle" if middle else "the scene's principal point"
     assert f"MODEL is drawn around {where}" in said
     assert "principal point" not in caplog.text  # it was asked for, so nothing is wrong
+
+
+@pytest.mark.parametrize("dropped", [True, False])
+def test_images_alpha_counts_as_the_model_shows_it_where_nothing_tells(
+    data, path, tmp_path, dropped
+):
+    """3DGS drops that of a COLMAP scene's images; some of its forks do not."""
+    for image in sorted((data / "images").iterdir()):
+        with Image.open(image) as picture:
+            faint = picture.convert("RGBA")
+        alpha = Image.linear_gradient("L").resize(faint.size).point(lambda x: max(x, 128))
+        if not dropped:  # composited over black, the picture is what the model shows
+            shown = np.asarray(faint, np.float32)[..., :3]
+            whole = shown / (np.asarray(alpha, np.float32)[..., None] / 255)
+            faint = Image.fromarray(whole.clip(0, 255).astype(np.uint8)).convert("RGBA")
+        faint.putalpha(alpha)
+        faint.save(image)
+    psnr = run_json("profile", path, "--data", data)["psnr"]
+    assert psnr > 25  # of faint colours at 8 bits
+    assert run_json("compare", path, path, "--data", data)["a"]["psnr"] == psnr
+    pruned = tmp_path / "r.ply"
+    result = run("finetune", path, "--data", data, "--out", pruned, "--iters", 2)
+    assert ("ignores the images' alpha" in result.stderr) == dropped
+    assert "another scene" not in result.stderr
+    assert run_json("profile", pruned, "--data", data)["psnr"] == pytest.approx(psnr, abs=1)
 
 
 def test_an_orbit_is_one_also_where_the_trainings_cameras_are_known(output):

@@ -22,9 +22,9 @@ from fragprune_plugins.workbench.commands.opening import (
 from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
 from fragprune_plugins.workbench.figures import records, wording
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
+from fragprune_plugins.workbench.figures.matching import told_or_matched
 from fragprune_plugins.workbench.figures.pictures import leave_panels
 from fragprune_plugins.workbench.models.model import load, writable_folder
-from fragprune_plugins.workbench.scenes.dataset import load_photographs
 from fragprune_plugins.workbench.scenes.output import trained_on
 
 
@@ -61,7 +61,8 @@ def compare(
         dataset, shown = own.pictures(candidates[0].model, rasterizer), "A's own"
     else:
         assert photographs is not None
-        dataset, shown = load_photographs(photographs).to(device), f"{photographs.folder}"
+        photographs, dataset = told_or_matched(candidates[0].model, photographs, rasterizer)
+        shown = f"{photographs.folder}"
     shots = chosen(dataset, views)
     before, after = measure_all(candidates, shots, engine=rasterizer, enlarge=enlarge)
     measured = [(str(a), before), (str(b), after)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import statistics
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -16,7 +15,6 @@ from fragprune_plugins.files.atomic import locked
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.learning.interruption import sigterm_interrupts
-from fragprune_plugins.learning.stage2 import evenly_spaced
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import (
     open_engine,
@@ -26,7 +24,8 @@ from fragprune_plugins.workbench.commands.opening import (
 from fragprune_plugins.workbench.commands.options import require_several
 from fragprune_plugins.workbench.distributed import ShardedEngine, part_of, whole_of
 from fragprune_plugins.workbench.figures import records
-from fragprune_plugins.workbench.figures.evaluate import Candidate, psnrs
+from fragprune_plugins.workbench.figures.evaluate import Candidate
+from fragprune_plugins.workbench.figures.matching import matched, shown
 from fragprune_plugins.workbench.finetune import api, resuming
 from fragprune_plugins.workbench.finetune import finished as finetuned
 from fragprune_plugins.workbench.finetune.finished import Asked, Finetuned
@@ -39,7 +38,7 @@ from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.models.model import require_place
 from fragprune_plugins.workbench.pruning import kept
 from fragprune_plugins.workbench.ranks import Ranks, joined, launched
-from fragprune_plugins.workbench.scenes.dataset import OFF_CENTRE, Dataset, load_photographs
+from fragprune_plugins.workbench.scenes.dataset import Dataset, load_photographs
 from fragprune_plugins.workbench.scenes.generated import views_near
 from fragprune_plugins.workbench.scenes.output import CAMERAS
 from fragprune_plugins.workbench.scenes.training import exposed, moved, saw_held_out
@@ -129,7 +128,7 @@ def _open(asked: Asked) -> _Opened:
         if asked.shard:
             dataset = load_photographs(photographs)
         else:
-            photographs, dataset = aimed(whole, photographs, engine)
+            photographs, dataset = matched(whole, photographs, engine)
     checkpoints = Checkpoints(resuming.path_beside(asked.out), resuming.EVERY, tell=_say)
     configuration = resuming.configuration(whole, dataset, settings, engine.name)
     configuration |= {"keep": asked.keep} | ({"sharded": True} if asked.shard else {})
@@ -137,29 +136,6 @@ def _open(asked: Asked) -> _Opened:
     return _Opened(
         asked, whole, photographs, dataset, engine, device, checkpoints, configuration, seen
     )
-
-
-def aimed(model: Model, read: Photographs, engine: Engine) -> tuple[Photographs, Dataset]:
-    """Photographs around the middle, or the scene's own principal point: as the model shows them.
-
-    3DGS and most of its descendants take the middle, whatever the scene says; others do not.
-    """
-    dataset = load_photographs(replace(read, centred=True))  # nothing is wrong with another point
-    if dataset.off_centre <= OFF_CENTRE:
-        return read, dataset.aimed(bool(read.centred))
-    ways = [dataset.aimed(centred).to(model.device) for centred in (False, True)]
-    own, middle = (_shown(model, each, engine) for each in ways)
-    centred = middle >= own
-    where, otherwise = "the middle", own
-    if not centred:
-        where, otherwise = "the scene's principal point", middle
-    _say(f"MODEL is drawn around {where}: {max(own, middle):.1f} dB, {otherwise:.1f} otherwise.")
-    return replace(read, centred=centred), ways[centred]
-
-
-def _shown(model: Model, dataset: Dataset, engine: Engine) -> float:
-    """How well a model shows up to eight training pictures, dB of PSNR."""
-    return statistics.fmean(psnrs(Candidate(model), evenly_spaced(dataset.train, 8), engine)[0])
 
 
 def _finished(opened: _Opened) -> Report | None:
@@ -187,10 +163,10 @@ def _tried(opened: _Opened) -> tuple[_Opened, float | None]:
 
 def _warn_of_another_scene(opened: _Opened, dataset: Dataset) -> None:
     """Warn before the learning of photographs that the model does not show."""
-    shown = _shown(opened.whole, dataset, opened.engine)
-    if shown < OTHER_SCENE:
+    showing = shown(opened.whole, dataset, opened.engine)
+    if showing < OTHER_SCENE:
         _say(
-            f"warning: MODEL shows its photographs at {shown:.1f} dB PSNR, as if they were of "
+            f"warning: MODEL shows its photographs at {showing:.1f} dB PSNR, as if they were of "
             "another scene. Check --data, --images, --resolution and --white-background."
         )
     if not opened.asked.itself and (name := moved(opened.asked.model, dataset)):

@@ -16,10 +16,10 @@ from fragprune_plugins.workbench.commands.opening import (
 )
 from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
+from fragprune_plugins.workbench.figures.matching import told_or_matched
 from fragprune_plugins.workbench.figures.pictures import leave_panels
 from fragprune_plugins.workbench.figures.wording import PROFILED, describe, nothing_drawn
 from fragprune_plugins.workbench.models.model import load, writable_folder
-from fragprune_plugins.workbench.scenes.dataset import load_photographs
 
 
 def profile(
@@ -44,7 +44,8 @@ def profile(
         dataset = own.pictures(loaded.untruncated(), rasterizer)
     else:
         remedy = "Name the scene's folder with --data; without photographs, pass --self."
-        dataset = load_photographs(photographs_for(model, scene, remedy=remedy)).to(device)
+        read = photographs_for(model, scene, remedy=remedy)
+        _, dataset = told_or_matched(loaded.untruncated(), read, rasterizer)
     shots = chosen(dataset, views)
     columns = {"untruncated": Candidate(loaded.untruncated())}
     if loaded.falloff is not None:

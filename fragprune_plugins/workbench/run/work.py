@@ -38,8 +38,8 @@ from fragprune_plugins.workbench.commands.opening import bound_threads, open_eng
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.figures import records, wording
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
+from fragprune_plugins.workbench.figures.matching import matched, told_or_matched
 from fragprune_plugins.workbench.finetune.trial import Trial, tried
-from fragprune_plugins.workbench.finetune.work import aimed
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.pruning import kept
 from fragprune_plugins.workbench.run.afterwards import Unserved, train_then_finetune, unserved
@@ -235,7 +235,7 @@ def _settled(read: records.Recorded, engine: EngineOptions) -> records.Recorded:
     rasterizer, where = _opened(engine)
     model = load(read.models[0], filtered=read.filtered, device=where)
     host = _AsTheHost(rasterizer.name, rasterizer, read.drawing)
-    return replace(read, photographs=aimed(model, read.photographs, host)[0])
+    return replace(read, photographs=matched(model, read.photographs, host)[0])
 
 
 def measure_models(read: records.Recorded, engine: EngineOptions) -> list[dict[str, Any]]:
@@ -337,9 +337,7 @@ class Looking:
         rasterizer, device = open_engine(self.engine)
         engine = _AsTheHost(rasterizer.name, rasterizer, drawing)
         model = load(ply, filtered=True, device=device)
-        if photographs.centred is None:  # as _settled asks
-            photographs, _ = aimed(model, photographs, engine)
-        dataset = load_photographs(photographs).to(device)
+        _, dataset = told_or_matched(model, photographs, engine)
         self.seen |= saw_held_out(ply, dataset)
         trial, left = tried(model, dataset, settings, engine=engine, say=log.info), None
         if trial.keep is not None:

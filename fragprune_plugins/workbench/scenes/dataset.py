@@ -141,14 +141,22 @@ class Photograph(Shot):
 
     __repr__ = one_line
 
-    def aimed(self, centred: bool) -> Photograph:
-        """The same pixels around the middle, or around the principal point of its camera."""
+    def read_as(self, centred: bool, opaque: bool) -> Photograph:
+        """The same around the middle or its camera's principal point, with or without alpha."""
+        slot = self._pixels if opaque == self.opaque else PixelSlot()
+        same = replace(self, opaque=opaque, _pixels=slot)
         if self.camera is None:
-            return self
+            return same
         seen, behind = self.camera.resized(self.view.width, self.view.height), self.view.background
         if centred:
             seen = replace(seen, cx=seen.width / 2, cy=seen.height / 2)
-        return replace(self, view=seen.view(behind.cpu())).to(behind.device)
+        return replace(same, view=seen.view(behind.cpu())).to(behind.device)
+
+    @property
+    def transparent(self) -> bool:
+        """Whether the image has an alpha channel; its header is read."""
+        with opened(self.path) as file:
+            return file.has_transparency_data
 
     @property
     def image(self) -> Tensor:
@@ -241,10 +249,15 @@ class Dataset:
         cameras = (getattr(shot, "camera", None) for shot in (*self.train, *self.test))
         return max((each.off_centre for each in cameras if each), default=0.0)
 
-    def aimed(self, centred: bool) -> Dataset:
-        """The same with ``aimed`` photographs."""
+    @property
+    def transparent(self) -> bool:
+        """Whether a training photograph has an alpha channel."""
+        return any(shot.transparent for shot in self.train if isinstance(shot, Photograph))
+
+    def read_as(self, centred: bool, opaque: bool) -> Dataset:
+        """The same with photographs that are ``read_as`` this."""
         train, test = (
-            [shot.aimed(centred) if isinstance(shot, Photograph) else shot for shot in part]
+            [s.read_as(centred, opaque) if isinstance(s, Photograph) else s for s in part]
             for part in (self.train, self.test)
         )
         return Dataset(train, test)
@@ -297,7 +310,8 @@ def load_dataset(
             remedy = "Keep the sub-folders that the scene names below its folder of images."
             raise DatasetError(str(path), found, expected, remedy)
     train, test = ([make_shot(row, background, size, opaque) for row in part] for part in rows)
-    dataset = Dataset(train, test).aimed(True) if centred else Dataset(train, test)
+    dataset = Dataset(train, test)
+    dataset = dataset.read_as(True, opaque) if centred else dataset
     straight = all(row.lens is None for part in rows for row in part)
     off = dataset.off_centre if straight and centred is None else 0
     if off > OFF_CENTRE and not transforms.has_transforms(Path(folder)):

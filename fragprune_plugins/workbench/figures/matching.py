@@ -1,0 +1,53 @@
+"""Reads photographs as a model shows them, whatever its training is said to have done."""
+
+from __future__ import annotations
+
+import statistics
+from dataclasses import replace
+from itertools import product
+
+import click
+
+from fragprune_plugins.engines import Engine
+from fragprune_plugins.files.model import Model
+from fragprune_plugins.hosts.photographs import Photographs
+from fragprune_plugins.learning.stage2 import evenly_spaced
+from fragprune_plugins.workbench.figures.evaluate import Candidate, psnrs
+from fragprune_plugins.workbench.scenes.dataset import OFF_CENTRE, Dataset, load_photographs
+
+
+def matched(model: Model, read: Photographs, engine: Engine) -> tuple[Photographs, Dataset]:
+    """Photographs around the middle or the scene's principal point, with or without their alpha.
+
+    3DGS and most of its descendants take the middle, whatever the scene says, and drop the alpha of
+    a COLMAP scene's images; others do not. The way in which the model shows its training
+    photographs best is taken.
+    """
+    dataset = load_photographs(replace(read, centred=True))  # nothing is wrong with another point
+    told = bool(read.centred), read.opaque
+    points = (True, False) if dataset.off_centre > OFF_CENTRE else told[:1]
+    alphas = (told[1], not told[1]) if dataset.transparent else told[1:]
+    ways = {way: dataset.read_as(*way).to(model.device) for way in product(points, alphas)}
+    if len(ways) == 1:
+        return read, ways[told]
+    figures = {way: shown(model, each, engine) for way, each in ways.items()}
+    best, *others = sorted(figures, key=figures.__getitem__, reverse=True)
+    if best != (read.centred, read.opaque):
+        where = "the middle" if best[0] else "the scene's principal point"
+        drawn = [f"is drawn around {where}"] * (len(points) > 1)
+        drawn += [f"{'ignores' if best[1] else 'keeps'} the images' alpha"] * (len(alphas) > 1)
+        said = f"{figures[best]:.1f} dB, {figures[others[0]]:.1f} otherwise."
+        click.echo(f"MODEL {' and '.join(drawn)}: {said}", err=True)
+    return replace(read, centred=best[0], opaque=best[1]), ways[best]
+
+
+def told_or_matched(model: Model, read: Photographs, engine: Engine) -> tuple[Photographs, Dataset]:
+    """The same, but where its training or a record tells how photographs were read, as it says."""
+    if read.centred is None:
+        return matched(model, read, engine)
+    return read, load_photographs(read).to(model.device)
+
+
+def shown(model: Model, dataset: Dataset, engine: Engine) -> float:
+    """How well a model shows up to eight training pictures, dB of PSNR."""
+    return statistics.fmean(psnrs(Candidate(model), evenly_spaced(dataset.train, 8), engine)[0])
