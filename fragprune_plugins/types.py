@@ -107,6 +107,18 @@ def check_fields(thing: Any, **shapes: tuple[int | None, ...]) -> None:
         check(f"{kind}.{name}", getattr(thing, name), *shape)
 
 
+def check_values(thing: Any, **checks: tuple[bool, object]) -> None:
+    """Check a dataclass's plain values.
+
+    Args:
+        checks: by a field's name, whether its value is right, and what is expected.
+    """
+    for name, (right, expected) in checks.items():
+        if not right:
+            where, found = f"{type(thing).__name__}.{name}", repr(getattr(thing, name))
+            raise InputError(where, found, str(expected), "Check the call's arguments.")
+
+
 def check_lens(
     width: int, height: int, fx: float, fy: float, cx: float | None, cy: float | None
 ) -> None:
@@ -287,22 +299,13 @@ class Splats:
         check_fields(self, opacities=(n,), scales=(n, 2 if self.flat else 3), rotations=(n, 4))
         check_fields(self, cov3d=(n, 6), sh=(n, first, 3), sh_rest=(n, None, 3), colors=(n, 3))
         _check_features("Splats.features", self.features, n)
-        if (self.scales is None) != (self.rotations is None) or (
-            (self.scales is None) == (self.cov3d is None)
-        ):
-            raise InputError(
-                "Splats",
-                "scales, rotations and cov3d as given",
-                "exactly one of (scales and rotations) or cov3d",
-                "Pass one of the two.",
-            )
+        remedy, turned = "Pass one of the two.", self.rotations is not None
+        if (self.scales is not None) != turned or turned == (self.cov3d is not None):
+            expected = "exactly one of (scales and rotations) or cov3d"
+            raise InputError("Splats", "scales, rotations and cov3d as given", expected, remedy)
         if (self.sh is None) == (self.colors is None):
-            raise InputError(
-                "Splats",
-                "both or neither of sh and colors",
-                "exactly one of them",
-                "Pass one of the two.",
-            )
+            found = "both or neither of sh and colors"
+            raise InputError("Splats", found, "exactly one of them", remedy)
         check_degree("Splats", self.sh, self.sh_degree, self.sh_rest)
 
     def __len__(self) -> int:
@@ -438,32 +441,21 @@ class RasterInputs:
     def __post_init__(self) -> None:
         size = self.view.height, self.view.width
         check_fields(self, means2d_hook=(len(self.splats), None), sample_offsets=(*size, 2))
-        stop, highest = self.stop, 1 if self.stop is None else STOPPED_ALPHA_MAX
-        checks = (
-            ("compensation", self.compensation in get_args(Compensation), get_args(Compensation)),
-            ("near", self.near >= 0, "0 or more"),
-            ("stop", is_stop(stop), "None, or 1e-4 to 1"),
-            ("rim", self.rim in get_args(Rim), get_args(Rim)),
-            ("alpha_max", ALPHA_MIN <= self.alpha_max <= highest, f"1/255 to {highest}"),
-            ("planes", set(self.planes) <= set(get_args(Plane)), f"of {get_args(Plane)}"),
+        highest = 1 if self.stop is None else STOPPED_ALPHA_MAX
+        check_values(
+            self,
+            compensation=(self.compensation in get_args(Compensation), get_args(Compensation)),
+            near=(self.near >= 0, "0 or more"),
+            stop=(is_stop(self.stop), "None, or 1e-4 to 1"),
+            rim=(is_rim(self.rim), get_args(Rim)),
+            alpha_max=(ALPHA_MIN <= self.alpha_max <= highest, f"1/255 to {highest}"),
+            planes=(set(self.planes) <= set(get_args(Plane)), f"of {get_args(Plane)}"),
         )
-        for name, holds, expected in checks:
-            if not holds:
-                raise InputError(
-                    f"RasterInputs.{name}",
-                    repr(getattr(self, name)),
-                    str(expected),
-                    "Check the call's arguments.",
-                )
         self._check_surfels()
         hook = self.means2d_hook
         if self.absolute_gradient and hook is not None and hook.shape[1] < 3:
-            raise InputError(
-                "RasterInputs.means2d_hook",
-                f"{hook.shape[1]} columns",
-                "3 or more with absolute_gradient",
-                "Pass a wider hook.",
-            )
+            found, expected = f"{hook.shape[1]} columns", "3 or more with absolute_gradient"
+            raise InputError("RasterInputs.means2d_hook", found, expected, "Pass a wider hook.")
 
     def _check_surfels(self) -> None:
         """Raise InputError if surfels come with what their rasterizer does not know."""
@@ -478,12 +470,8 @@ class RasterInputs:
             "a soft rim": self.rim != "hard",
         }
         if any(given.values()):
-            raise InputError(
-                "RasterInputs",
-                f"surfels (2 scales each) with {', '.join(k for k, v in given.items() if v)}",
-                "surfels without them",
-                "Leave them out.",
-            )
+            found = f"surfels (2 scales each) with {', '.join(k for k, v in given.items() if v)}"
+            raise InputError("RasterInputs", found, "surfels without them", "Leave them out.")
 
     def check_thresholds(self, thresholds: Tensor | None) -> None:
         """Raise InputError unless there is one threshold per Gaussian, or None.

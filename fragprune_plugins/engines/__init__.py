@@ -61,19 +61,12 @@ def device_for(wanted: str = "auto", engine: str = "auto") -> torch.device:
         return torch.device("cpu")
     device = torch.device(wanted)
     if device.type == "cuda" and (device.index or 0) >= seen:
-        raise UsageError(
-            f"--device {wanted}",
-            f"{seen or 'no'} CUDA device{'' if seen == 1 else 's'}",
-            f"{wanted}, as torch sees it",
-            "Use --device cpu, or auto.",
-        )
+        found = f"{seen or 'no'} CUDA device{'' if seen == 1 else 's'}"
+        expected, remedy = f"{wanted}, as torch sees it", "Use --device cpu, or auto."
+        raise UsageError(f"--device {wanted}", found, expected, remedy)
     if engine in ("cpu", "cuda") and device.type != engine:
-        raise UsageError(
-            f"--device {wanted}",
-            f"--engine {engine}",
-            f"--device {engine}, where it draws",
-            "Leave one of the two out.",
-        )
+        expected, remedy = f"--device {engine}, where it draws", "Leave one of the two out."
+        raise UsageError(f"--device {wanted}", f"--engine {engine}", expected, remedy)
     return device
 
 
@@ -88,12 +81,9 @@ def create_engine(name: str, device: torch.device | str = "cpu") -> Engine:
     """
     if name == "auto" and str(device).startswith("cuda"):
         if (why_not := _why_not_cuda(str(device))) is not None:
-            raise EngineError(
-                "engine 'auto'",
-                why_not[0],
-                "an engine that draws on a GPU in a reasonable time",
-                f"{why_not[1]} Or draw on the CPU: --device cpu. --engine reference is slow.",
-            )
+            expected = "an engine that draws on a GPU in a reasonable time"
+            remedy = f"{why_not[1]} Or draw on the CPU: --device cpu. --engine reference is slow."
+            raise EngineError("engine 'auto'", why_not[0], expected, remedy)
         name = "cuda"
     elif name == "auto":
         from fragprune_plugins.engines.cpu import binding
@@ -101,9 +91,8 @@ def create_engine(name: str, device: torch.device | str = "cpu") -> Engine:
         native = str(device).startswith("cpu") and binding.available()
         name = "cpu" if native else "reference"
     if name not in ENGINES:
-        raise EngineError(
-            "engine", repr(name), f"one of auto, {', '.join(ENGINES)}", "Choose one of these."
-        )
+        expected = f"one of auto, {', '.join(ENGINES)}"
+        raise EngineError("engine", repr(name), expected, "Choose one of these.")
     module, _, kind = ENGINES[name].partition(":")
     engine: Engine = getattr(import_module(f"{__name__}.{module}"), kind)()
     return engine

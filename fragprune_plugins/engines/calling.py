@@ -61,9 +61,8 @@ def expect_ok(status: int, error: binding.Error) -> None:
     text = error.message.decode(errors="replace")
     if status == binding.OUT_OF_MEMORY:
         raise MemoryError(f"fragprune's cpu engine: {text}")
-    raise EngineError(
-        "engine 'cpu'", text, "inputs it can draw", "Check the camera and the Gaussians."
-    )
+    remedy = "Check the camera and the Gaussians."
+    raise EngineError("engine 'cpu'", text, "inputs it can draw", remedy)
 
 
 def native_arrays(

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import ctypes
 from functools import cache
-from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
-from fragprune_plugins.engines.calling import address, empty, expect_ok, native_threads, plain
+from fragprune_plugins.engines.calling import (
+    Wanted,
+    address,
+    empty,
+    expect_ok,
+    in_graph,
+    native_threads,
+    plain,
+)
 from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.errors import InputError
 from fragprune_plugins.types import short
@@ -41,27 +47,19 @@ def compiled_loss(
             remedy = "workbench.finetune.losses.photometric_loss takes any dtype and device."
             raise InputError(name, short(tensor), "(C, H, W) float32 on the cpu", remedy)
     if image.shape != target.shape:
-        raise InputError(
-            "target", short(target), f"the image's shape {tuple(image.shape)}", "Resize it."
-        )
+        expected = f"the image's shape {tuple(image.shape)}"
+        raise InputError("target", short(target), expected, "Resize it.")
     if target.requires_grad:
         raise InputError("target", "requires_grad", "a constant", "Detach it.")
-    given = binding.library() if library is None else library
-    loss: Tensor = _Compiled.apply(image, target, ssim_weight, given)  # type: ignore[no-untyped-call]
-    return loss
+    opened = binding.library() if library is None else library
+    gradients: list[Tensor] = []
 
-
-class _Compiled(torch.autograd.Function):
-    """Value and gradient in one pass."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, image: Tensor, target: Tensor, ssim_weight: float, library: binding.Library
-    ) -> Tensor:
+    def draw(wanted: Wanted) -> dict[str, Tensor]:
+        """Value and gradient in one pass."""
         x, y = plain(image), plain(target)
         channels, height, width = x.shape
-        workspace = _workspace(library)
-        gradient = empty(workspace, *x.shape) if ctx.needs_input_grad[0] else None
+        workspace = _workspace(opened)
+        gradients.extend(empty(workspace, *x.shape) for _ in wanted)
         images = binding.Photometric(
             threads=native_threads(),
             channels=channels,
@@ -71,19 +69,17 @@ class _Compiled(torch.autograd.Function):
             ssim_weight=ssim_weight,
             image=address(x),
             target=address(y),
-            gradient=address(gradient),
+            gradient=address(gradients[0]) if gradients else None,
             workspace=workspace.handle,
         )
         error = binding.Error()
-        call = library.calls.fragprune_photometric_loss
+        call = opened.calls.fragprune_photometric_loss
         expect_ok(call(ctypes.byref(images), ctypes.byref(error)), error)
-        if gradient is not None:
-            ctx.save_for_backward(gradient)
-        return x.new_tensor((1 - ssim_weight) * images.l1 + ssim_weight * images.dissimilarity)
+        value = (1 - ssim_weight) * images.l1 + ssim_weight * images.dissimilarity
+        return {"loss": x.new_tensor(value)}
 
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        (gradient,) = ctx.saved_tensors
-        scaled = gradient if upstream == 1 else gradient * upstream
-        return scaled, None, None, None
+    def undraw(wanted: Wanted, by: dict[str, Tensor]) -> dict[str, Tensor]:
+        upstream = by["loss"]
+        return {"image": gradients[0] if upstream == 1 else gradients[0] * upstream}
+
+    return in_graph({"image": image}, draw, undraw, {"loss": frozenset(("image",))})["loss"]

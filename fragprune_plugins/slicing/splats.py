@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from fragprune_plugins.errors import InputError
-from fragprune_plugins.types import check_degree, check_fields, one_line
+from fragprune_plugins.types import check_degree, check_fields, check_values, one_line
 
 if TYPE_CHECKING:
     import torch
@@ -60,12 +60,10 @@ class SpacetimeSplats:
             for name in ("cov3d", "scales", "rotations", "scales_t", "rotations_r")
         )
         if given not in _SPACETIME_KINDS or (self.scales_t is not None and self.times is None):
-            raise InputError(
-                "SpacetimeSplats",
-                "cov3d, scales, rotations and times as given",
-                "cov3d alone, or scales and rotations, with scales_t and times, with rotations_r",
-                "Pass one of the four.",
-            )
+            found = "cov3d, scales, rotations and times as given"
+            expected = "cov3d alone, or scales and rotations, with scales_t and times, "
+            expected += "with rotations_r"
+            raise InputError("SpacetimeSplats", found, expected, "Pass one of the four.")
         check_degree("SpacetimeSplats", self.sh, self.sh_degree)
 
     def __len__(self) -> int:
@@ -110,18 +108,11 @@ class Moment:
 
     def __post_init__(self) -> None:
         check_fields(self, campos=(3,))
-        checks = (
-            ("duration", self.duration > 0, "above 0"),
-            ("sh_degree_t", self.sh_degree_t in (None, 0, 1, 2), "None, 0, 1 or 2"),
+        check_values(
+            self,
+            duration=(self.duration > 0, "above 0"),
+            sh_degree_t=(self.sh_degree_t in (None, 0, 1, 2), "None, 0, 1 or 2"),
         )
-        for name, holds, expected in checks:
-            if not holds:
-                raise InputError(
-                    f"Moment.{name}",
-                    repr(getattr(self, name)),
-                    expected,
-                    "Check the call's arguments.",
-                )
 
 
 @dataclass(frozen=True)

@@ -222,30 +222,20 @@ def usable_builds() -> list[str]:
     return []
 
 
-def choose(wanted: str) -> Library:
-    """Open the build of this name, or the best build for "".
-
-    Raises:
-        Unavailable: the engine is switched off, or no build can be used.
-    """
-    if wanted in ("off", "0"):
-        raise Unavailable(f"switched off by {ENVIRONMENT}={wanted}")
-    if wanted and wanted not in BUILDS:
-        names = ", ".join(["off", *BUILDS])
-        raise Unavailable(f"{ENVIRONMENT}={wanted} is not one of {names}")
-    features = cpu_features()
-    if not wanted:
-        return next(_usable(features))
-    if BUILDS[wanted] & ~features:
-        raise Unavailable(f"{ENVIRONMENT}={wanted}, which this processor lacks")
-    return open_build(wanted)
-
-
 @cache
 def _chosen(wanted: str) -> Library | str:
-    """The library, or the reason why there is none."""
+    """The build of this name, the best one for "", or the reason why there is none."""
+    if wanted in ("off", "0"):
+        return f"switched off by {ENVIRONMENT}={wanted}"
+    if wanted and wanted not in BUILDS:
+        return f"{ENVIRONMENT}={wanted} is not one of {', '.join(['off', *BUILDS])}"
     try:
-        return choose(wanted)
+        features = cpu_features()
+        if not wanted:
+            return next(_usable(features))
+        if BUILDS[wanted] & ~features:
+            return f"{ENVIRONMENT}={wanted}, which this processor lacks"
+        return open_build(wanted)
     except Unavailable as why:
         return str(why)
 
@@ -269,12 +259,8 @@ def library() -> Library:
     answer = chosen()
     if isinstance(answer, Library):
         return answer
-    raise EngineError(
-        "engine 'cpu'",
-        answer,
-        "a compiled rasterizer",
-        "Reinstall where a C++17 compiler is found, or use the engine 'reference'.",
-    )
+    remedy = "Reinstall where a C++17 compiler is found, or use the engine 'reference'."
+    raise EngineError("engine 'cpu'", answer, "a compiled rasterizer", remedy)
 
 
 class Workspace:

@@ -62,14 +62,10 @@ class Driver:
     kind = "cuda"
 
     def __init__(self) -> None:
-        why = missing()
-        if why is not None:
-            raise EngineError(
-                "engine 'cuda'",
-                why,
-                "a CUDA device, and NVRTC, through cuda-bindings",
-                f"{remedy()} Or use the engine 'reference'.",
-            )
+        if (why := missing()) is not None:
+            expected = "a CUDA device, and NVRTC, through cuda-bindings"
+            instead = f"{remedy()} Or use the engine 'reference'."
+            raise EngineError("engine 'cuda'", why, expected, instead)
         from cuda.bindings import driver
 
         self._driver: Any = driver
@@ -87,7 +83,7 @@ class Driver:
         blocks: int,
         arguments: ctypes.Structure,
     ) -> None:
-        """Run a kernel on the current stream of a device; see ``engines.frames.Device``.
+        """Run a kernel on the current stream of a device; see ``frame.Device``.
 
         Raises:
             KernelError: the kernel does not compile or load.
@@ -142,22 +138,15 @@ class Driver:
             why = "; ".join(failures)
         except kernels.Unavailable as error:
             why = str(error)
-        raise KernelError(
-            f"kernels of {source}.cu",
-            why,
-            f"code for compute capability {major}.{minor}",
-            f"Match {compiler.name} {compiler.version} with the GPU's driver: "
-            "update the driver, or install an older toolkit.",
-        )
+        expected = f"code for compute capability {major}.{minor}"
+        instead = f"Match {compiler.name} {compiler.version} with the GPU's driver: update the "
+        instead += "driver, or install an older toolkit."
+        raise KernelError(f"kernels of {source}.cu", why, expected, instead)
 
     def _call(self, function: str, *arguments: Any) -> Any:
         """Call a function of the driver; returns its only result, if any."""
         status, *results = getattr(self._driver, function)(*arguments)
         if int(status) != 0:
-            raise EngineError(
-                f"CUDA driver, {function}",
-                status.name,
-                "CUDA_SUCCESS",
-                "Run again with CUDA_LAUNCH_BLOCKING=1 to find the kernel that failed.",
-            )
+            instead = "Run again with CUDA_LAUNCH_BLOCKING=1 to find the kernel that failed."
+            raise EngineError(f"CUDA driver, {function}", status.name, "CUDA_SUCCESS", instead)
         return results[0] if results else None

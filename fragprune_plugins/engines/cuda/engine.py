@@ -47,19 +47,15 @@ class CudaEngine:
         """
         inputs.check_thresholds(thresholds)
         if isinstance(inputs.splats, Splats) and inputs.splats.flat:
-            raise EngineError(
-                "engine 'cuda'",
-                "surfels (2 scales each)",
-                "3D Gaussians: there are no kernels for surfels",
-                "Run on the CPU (--device cpu), or draw small pictures with --engine reference.",
+            expected = "3D Gaussians: there are no kernels for surfels"
+            remedy = (
+                "Run on the CPU (--device cpu), or draw small pictures with --engine reference."
             )
+            raise EngineError("engine 'cuda'", "surfels (2 scales each)", expected, remedy)
         if inputs.rim != "hard" and thresholds is not None:
-            raise InputError(
-                "engine 'cuda'",
-                f"a {inputs.rim} rim",
-                "a hard rim: there are no kernels for another",
-                "Run on the CPU (--device cpu), or draw it hard: replace(inputs, rim='hard').",
-            )
+            expected = "a hard rim: there are no kernels for another"
+            remedy = "Run on the CPU (--device cpu), or draw it hard: replace(inputs, rim='hard')."
+            raise InputError("engine 'cuda'", f"a {inputs.rim} rim", expected, remedy)
         self.expect_on_device(inputs.splats.device)
         if isinstance(inputs.splats, Splats):
             inputs = replace(inputs, splats=with_joined_sh(inputs.splats))
@@ -75,12 +71,9 @@ class CudaEngine:
     def expect_on_device(self, where: torch.device) -> None:
         """Raise InputError unless Gaussians there can be drawn."""
         if where.type != self.device.kind:
-            raise InputError(
-                "engine 'cuda'",
-                f"Gaussians on {where}",
-                f"tensors on a {self.device.kind} device",
-                "Move the Gaussians, or use the engine 'cpu'.",
-            )
+            expected = f"tensors on a {self.device.kind} device"
+            remedy = "Move the Gaussians, or use the engine 'cpu'."
+            raise InputError("engine 'cuda'", f"Gaussians on {where}", expected, remedy)
 
     def draw(self, drawing: Drawing, wanted: Wanted) -> dict[str, Tensor]:
         """Run the forward pass; repeat it with more room if the lists did not fit."""

@@ -397,19 +397,13 @@ class Drawing:
         _, entries, _, self.evaluated = map(int, self._found.tolist())
         self.entries = entries
         if entries > ENTRIES_MAX:
-            raise EngineError(
-                "engine 'cuda'",
-                f"{entries} entries in the tiles' lists",
-                f"at most {ENTRIES_MAX}",
-                "Draw fewer Gaussians or a smaller image.",
-            )
+            found = f"{entries} entries in the tiles' lists"
+            remedy = "Draw fewer Gaussians or a smaller image."
+            raise EngineError("engine 'cuda'", found, f"at most {ENTRIES_MAX}", remedy)
         if self._spread is not None and not self._spread <= OFFSET_MAX:
-            raise EngineError(
-                "engine 'cuda'",
-                f"sample_offsets up to {float(self._spread)}",
-                f"at most {OFFSET_MAX:g} pixels",
-                "Check the offsets.",
-            )
+            found = f"sample_offsets up to {float(self._spread)}"
+            expected = f"at most {OFFSET_MAX:g} pixels"
+            raise EngineError("engine 'cuda'", found, expected, "Check the offsets.")
         return entries
 
     # ---- backward ------------------------------------------------------------------------------
