@@ -3,61 +3,27 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 
 from fragprune_plugins.errors import UnknownHostError
 from fragprune_plugins.hosts.adapter import HostAdapter, ScriptAdapter
-from fragprune_plugins.hosts.findings import Finding, Match
+from fragprune_plugins.hosts.findings import Match
 from fragprune_plugins.hosts.source import HostRepo, imported
 
 
-@dataclass(frozen=True)
-class Attempt:
-    """The result of one adapter on one codebase."""
+def attempt(repo: HostRepo, adapters: Sequence[HostAdapter]) -> dict[HostAdapter, Match]:
+    """Try each adapter on a codebase; the best fit comes first.
 
-    adapter: HostAdapter
-    match: Match
+    That is by the share of seams that hold, then by the kinds and by the size of the errors.
+    """
 
-    @property
-    def held(self) -> int:
-        """The number of seams that are as the adapter needs them."""
-        return sum(state.status == "found" for state in self.match.seams)
+    def order(tried: tuple[HostAdapter, Match]) -> tuple[bool, float, int, int]:
+        match = tried[1]
+        share = match.held / max(1, match.looked_up)
+        kinds = {finding.code for finding in match.errors}
+        return not match.fits, -share, len(kinds), sum(len(each.found) for each in match.errors)
 
-    @property
-    def looked_up(self) -> int:
-        """The number of seams that the source can decide."""
-        return sum(state.status != "at import" for state in self.match.seams)
-
-    @property
-    def order(self) -> tuple[bool, float, int, int]:
-        """Sort key: fits, share of seams that hold, kinds of errors, size of the errors."""
-        kinds = {finding.code for finding in self.errors}
-        complaint = sum(len(finding.found) for finding in self.errors)
-        share = self.held / max(1, self.looked_up)
-        return not self.match.fits, -share, len(kinds), complaint
-
-    @property
-    def errors(self) -> list[Finding]:
-        """The errors of the adapter on this codebase."""
-        return [finding for finding in self.match.findings if finding.level == "error"]
-
-    def verdict(self) -> str:
-        """Whether the adapter fits, and how many seams hold, as text."""
-        return (
-            f"{self.adapter.name} {'fits' if self.match.fits else 'does not fit'}: "
-            f"{self.held} of {self.looked_up} seams hold"
-        )
-
-    def brief(self) -> str:
-        """The verdict and the first error, if any, in one line."""
-        return self.verdict() + (f"; {self.errors[0].found}" if self.errors else "")
-
-
-def attempt(repo: HostRepo, adapters: Sequence[HostAdapter]) -> list[Attempt]:
-    """Try each adapter on a codebase; returns the results, best fit first."""
-    tried = (Attempt(adapter, adapter.match(repo)) for adapter in adapters)
-    return sorted(tried, key=lambda each: each.order)
+    return dict(sorted(((each, each.match(repo)) for each in adapters), key=order))
 
 
 def locate(
@@ -85,7 +51,7 @@ def locate(
             if named == adapter.name
             or (not name and repo.imports(package) and not (repo.root / package).is_dir())
         ]
-        if used and not name and any(each.held for each in attempt(repo, adapters)):
+        if used and not name and any(each.held for each in attempt(repo, adapters).values()):
             raise  # a host of its own, that draws by that package
         packages = [package for each in used if (package := HostRepo.installed(each))]
         for candidate in (*(folder_above(repo) if above else ()), *packages):
@@ -124,42 +90,42 @@ def choose(
     tried = attempt(repo, wanted)
     fitting = closest(tried, adapters)
     if len(fitting) == 1:
-        return fitting[0].adapter
+        return next(iter(fitting))
     if not fitting:
         others = [a.name for a in adapters if a not in wanted and a.match(repo).fits]
         found, expected = f"no adapter fits ({_nearest(tried)})", "one that an adapter knows"
         remedy = "Run fragprune check on the folder to see more, or write an adapter."
         remedy = f"Choose {' or '.join(others)}, which fits." if others else remedy
         raise UnknownHostError(str(repo.root), found, expected, remedy)
-    selected = select(repo=repo, matches=[each.match for each in fitting]) if select else None
+    selected = select(repo=repo, matches=[*fitting.values()]) if select else None
     for each in fitting:
-        if each.adapter.name == selected:
-            return each.adapter
-    found = f"several adapters fit: {', '.join(each.adapter.name for each in fitting)}"
+        if each.name == selected:
+            return each
+    found = f"several adapters fit: {', '.join(each.name for each in fitting)}"
     raise UnknownHostError(str(repo.root), found, "one", "Name it with --adapter.")
 
 
-def _nearest(tried: Sequence[Attempt]) -> str:
-    """The errors of the adapter that comes nearest, the first."""
+def _nearest(tried: Mapping[HostAdapter, Match]) -> str:
+    """The first error of the adapter that comes nearest."""
     if not tried:
         return "none is installed"
-    best = tried[0]
+    best = next(iter(tried.values()))
     if len(tried) == 1:
-        return f"{best.adapter.name}: {'; '.join(map(str, best.errors[:1]))}"
+        return f"{best.adapter}: {'; '.join(map(str, best.errors[:1]))}"
     return f"the nearest, {best.brief()}" if best.held else "none finds anything of its host"
 
 
-def closest(tried: Sequence[Attempt], adapters: Sequence[HostAdapter]) -> list[Attempt]:
+def closest(
+    tried: Mapping[HostAdapter, Match], adapters: Sequence[HostAdapter]
+) -> dict[HostAdapter, Match]:
     """The adapters that fit, without those that are ancestors of another one."""
-    fitting = [each for each in tried if each.match.fits]
-    parents = {adapter.name: adapter.descends_from for adapter in adapters}
-    ancestors: set[str] = set()
-    for each in fitting:
-        new = set(each.adapter.descends_from)
-        while new := new - ancestors:
-            ancestors |= new
-            new = {name for one in new for name in parents.get(one, ())}
-    return [each for each in fitting if each.adapter.name not in ancestors] or fitting
+    fitting = {each: match for each, match in tried.items() if match.fits}
+    parents = {each.name: each.descends_from for each in adapters}
+    ancestors: list[str] = [name for each in fitting for name in each.descends_from]
+    for name in ancestors:  # it grows
+        ancestors += (each for each in parents.get(name, ()) if each not in ancestors)
+    nearest = {each: match for each, match in fitting.items() if each.name not in ancestors}
+    return nearest or fitting
 
 
 def usage(adapter: HostAdapter, repo: HostRepo) -> str:

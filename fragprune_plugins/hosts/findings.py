@@ -61,6 +61,29 @@ class Match:
     findings: tuple[Finding, ...] = ()
     seams: tuple[SeamState, ...] = ()
 
+    @property
+    def errors(self) -> list[Finding]:
+        """What speaks against it."""
+        return [finding for finding in self.findings if finding.level == "error"]
+
+    @property
+    def held(self) -> int:
+        """The number of seams that are as the adapter needs them."""
+        return sum(state.status == "found" for state in self.seams)
+
+    @property
+    def looked_up(self) -> int:
+        """The number of seams that the source can decide."""
+        return sum(state.status != "at import" for state in self.seams)
+
+    def __str__(self) -> str:
+        fits = "fits" if self.fits else "does not fit"
+        return f"{self.adapter} {fits}: {self.held} of {self.looked_up} seams hold"
+
+    def brief(self) -> str:
+        """Whether it fits, and the first error, in one line."""
+        return "; ".join([str(self), *(error.found for error in self.errors[:1])])
+
 
 @dataclass(frozen=True)
 class Plain:

@@ -213,8 +213,8 @@ def test_a_fork_with_a_plain_ply_is_told_the_command(fork):
 
 def test_the_nearest_host_is_of_this_family(fork):
     adapters = load_plugins().adapters
-    tried = attempt(fork(), adapters)
-    assert [each.adapter.name for each in tried[:2]] == ["3dgs-fork", "vanilla-3dgs"]
+    tried = [*attempt(fork(), adapters).values()]
+    assert [each.adapter for each in tried[:2]] == ["3dgs-fork", "vanilla-3dgs"]
     assert not any(each.held for each in tried[-2:])
 
 

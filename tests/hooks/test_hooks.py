@@ -97,7 +97,7 @@ def test_hook_fragprune_read_models(tmp_path):
     assert not any(models_of(HostRepo(tmp_path), plugins))
     plugins.register(Reader(), "mine")
     assert all(models_of(HostRepo(tmp_path), plugins))
-    told = judge(HostRepo(tmp_path), [], [], plugins)
+    told = judge(HostRepo(tmp_path), {}, [], plugins)
     assert told.kind == "finetune"
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -11,9 +11,9 @@ from typing import Any, Literal
 
 from fragprune_plugins.errors import UnknownHostError
 from fragprune_plugins.hosts.adapter import HostAdapter, ScriptAdapter
-from fragprune_plugins.hosts.choosing import Attempt, attempt, closest, folder_above, locate, usage
+from fragprune_plugins.hosts.choosing import attempt, closest, folder_above, locate, usage
 from fragprune_plugins.hosts.dialect import Dialect, Proof
-from fragprune_plugins.hosts.findings import Finding, Plain
+from fragprune_plugins.hosts.findings import Finding, Match, Plain
 from fragprune_plugins.hosts.preflight import Missing, install, missing_imports
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import proofs
@@ -61,9 +61,9 @@ def _single(
     repo = _repository(host, adapters, adapter)
     tried = attempt(repo, adapters)
     fitting = closest(tried, adapters)
-    verdict = fitting[0] if len(fitting) == 1 else None
+    fits = next(iter(fitting)) if len(fitting) == 1 else None
     judged = judge(repo, tried, adapters, plugins)
-    kept = _kept(repo, verdict.adapter.dialect(repo)) if verdict else []
+    kept = _kept(repo, fits.dialect(repo)) if fits else []
     proved = [str(proof) for proof in kept if not proof.failed]
     failed = [str(proof) for proof in kept if proof.failed]
     if failed:
@@ -74,14 +74,14 @@ def _single(
         judged = replace(judged, sentence=sentence, reason="")
     elif above := "" if fitting else _above(repo, adapters):
         judged = replace(judged, sentence=above)
-    missing = _missing(repo, verdict.adapter) if verdict else []
+    missing = _missing(repo, fits) if isinstance(fits, ScriptAdapter) else []
     lines = [f"{repo.root}" + (f", commit {repo.commit}" if repo.commit else "")]
     lines += ["", judged.sentence]
     lines += [f"  {proof}" for proof in failed or proved]
     if adapter:
         lines += ["", *_in_full(tried, fitting)]
     elif judged.kind != "inside":  # its sentence is the command to go on with
-        lines += ["", *_in_short(tried, fitting, judged.differs)]
+        lines += ["", *_in_short([*tried.values()], [*fitting.values()], judged.differs)]
     if missing:
         lines += ["", f"Not installed, but imported: {', '.join(map(str, missing))}"]
         lines += [f"  {way}" for way in install(missing).splitlines()]
@@ -91,16 +91,16 @@ def _single(
         "host": str(host),
         "commit": repo.commit,
         **judged.as_dict(),
-        "fits": verdict.adapter.name if verdict else None,
+        "fits": fits.name if fits else None,
         "proved": proved,
         "failed": failed,
         "missing": [
             {"module": each.module, "distribution": each.distribution, "at": each.at}
             for each in missing
         ],
-        "adapters": [_as_dict(each) for each in tried],
+        "adapters": [_as_dict(*each) for each in tried.items()],
     }
-    return Report(data, "\n".join(lines), exit_code=0 if verdict and not failed else 1)
+    return Report(data, "\n".join(lines), exit_code=0 if fits and not failed else 1)
 
 
 def _table(hosts: tuple[Path, ...], adapters: list[HostAdapter], plugins: Plugins) -> Report:
@@ -128,69 +128,66 @@ _NEAREST = 3
 _KINDS = ("fits", "several", "inside", "finetune", "never")
 
 
-def _in_short(tried: list[Attempt], fitting: list[Attempt], differs: Sequence[str]) -> list[str]:
+def _in_short(tried: list[Match], fitting: list[Match], differs: Sequence[str]) -> list[str]:
     """A line for each adapter that fits; else how the nearest differs, and the next reasons."""
     shown = fitting or _nearest(tried)
     if not shown:
         return [f"None of {len(tried)} adapters knows anything of it."]
-    ancestors = [each for each in tried if each.match.fits and each not in shown]
+    ancestors = [each for each in tried if each.fits and each not in shown]
     others = len(tried) - len(shown) - len(ancestors)
-    differences = [] if fitting else [f"{shown[0].verdict()}:", *(f"  {each}" for each in differs)]
-    return [
-        *differences,
-        *(each.brief() for each in shown[bool(differences) :]),
-        *(f"{each.verdict()}; {_aside(each, fitting)}" for each in ancestors),
-        *([f"{others} others do not fit (--adapter NAME says why)."] if others else []),
-    ]
+    lines = [] if fitting else [f"{shown[0]}:", *(f"  {each}" for each in differs)]
+    lines += [each.brief() for each in (shown if fitting else shown[1:])]
+    lines += [_beside(each, fitting) for each in ancestors]
+    return lines + ([f"{others} others do not fit (--adapter NAME says why)."] if others else [])
 
 
-def _nearest(tried: list[Attempt]) -> list[Attempt]:
+def _nearest(tried: list[Match]) -> list[Match]:
     """The adapters that come nearest, of several with the same reason the first."""
-    reasons: dict[str, Attempt] = {}
+    reasons: dict[str, Match] = {}
     for each in tried:
         if each.held and each.errors:
             reasons.setdefault(each.errors[0].found, each)
     return list(reasons.values())[:_NEAREST]
 
 
-def _aside(tried: Attempt, fitting: list[Attempt]) -> str:
-    """The reason why an adapter is not among the best fits."""
-    nearer = ", ".join(each.adapter.name for each in fitting)
-    return str(tried.errors[0]) if tried.errors else f"{nearer} descends from it"
+def _beside(match: Match, fitting: Iterable[Match]) -> str:
+    """A line for an adapter that is not among the best fits, with the reason."""
+    nearer = ", ".join(each.adapter for each in fitting)
+    return f"{match}; {match.errors[0] if match.errors else f'{nearer} descends from it'}"
 
 
 _SIGNS = {"missing": "MISSING in", "changed": "CHANGED at", "at import": "(checked at import)"}
 
 
-def _in_full(tried: list[Attempt], fitting: list[Attempt]) -> list[str]:
+def _in_full(tried: Mapping[HostAdapter, Match], fitting: Mapping[HostAdapter, Match]) -> list[str]:
     """All seams of the adapters that fit, or of the nearest; the first error of each other one."""
-    shown = fitting or tried[:1]
+    shown = fitting or dict([*tried.items()][:1])
     lines = []
-    for each in shown:
-        info, of_seams = each.adapter.info, [state.finding for state in each.match.seams]
-        lines += ["", f"{each.verdict()} ({info.title}, {info.repo})"]
-        lines += [f"  {finding}" for finding in each.match.findings if finding not in of_seams]
-        for state in each.match.seams:
+    for adapter, match in shown.items():
+        info, of_seams = adapter.info, [state.finding for state in match.seams]
+        lines += ["", f"{match} ({info.title}, {info.repo})"]
+        lines += [f"  {finding}" for finding in match.findings if finding not in of_seams]
+        for state in match.seams:
             at = state.at if state.status == "found" else f"{_SIGNS[state.status]} {state.at}"
             if state.finding and state.status == "changed":
                 at += f": {state.finding.found}; expected {state.finding.expected}"
             lines.append(f"  {state.seam.role.name.lower():<10} {state.seam!s:<62} {at.strip()}")
-        if each.match.fits and info.limits:
+        if match.fits and info.limits:
             lines += ["  What does not work:", *(f"  - {limit}" for limit in info.limits)]
-    others = [each for each in tried if each not in shown]
+    others = [match for each, match in tried.items() if each not in shown]
     lines += ["", "Others:"] if others else []
-    return [*lines, *(f"  {each.verdict()}; {_aside(each, fitting)}" for each in others)]
+    return [*lines, *(f"  {_beside(each, fitting.values())}" for each in others)]
 
 
-def _as_dict(tried: Attempt) -> dict[str, Any]:
+def _as_dict(adapter: HostAdapter, match: Match) -> dict[str, Any]:
     """All findings and seams of one adapter, for --json."""
     return {
-        "adapter": tried.adapter.name,
-        "fits": tried.match.fits,
-        "seams_held": tried.held,
-        "seams_looked_up": tried.looked_up,
-        "findings": [finding.as_dict() for finding in tried.match.findings],
-        "limits": list(tried.adapter.info.limits),
+        "adapter": adapter.name,
+        "fits": match.fits,
+        "seams_held": match.held,
+        "seams_looked_up": match.looked_up,
+        "findings": [finding.as_dict() for finding in match.findings],
+        "limits": list(adapter.info.limits),
         "seams": [
             {
                 "role": state.seam.role.name,
@@ -198,16 +195,13 @@ def _as_dict(tried: Attempt) -> dict[str, Any]:
                 "status": state.status,
                 "at": state.at,
             }
-            for state in tried.match.seams
+            for state in match.seams
         ],
     }
 
 
-def _missing(repo: HostRepo, adapter: HostAdapter) -> list[Missing]:
-    """Packages that the training scripts import and that are not installed; [] for a library."""
-
-    if not isinstance(adapter, ScriptAdapter):
-        return []
+def _missing(repo: HostRepo, adapter: ScriptAdapter) -> list[Missing]:
+    """Packages that the training scripts import and that are not installed."""
     scripts, dialect = adapter.command_line(repo).scripts, adapter.dialect(repo)
     answered = {*dialect.names(), *dialect.unneeded}
     return missing_imports(repo, [repo.root / name for name in scripts], answered)
@@ -251,17 +245,17 @@ def _above(repo: HostRepo, adapters: list[HostAdapter]) -> str:
     for above in folder_above(repo):
         for fits in closest(attempt(above, adapters), adapters):
             return (
-                f"Its scripts use the folder above, which fits {fits.adapter.name}, as run finds: "
+                f"Its scripts use the folder above, which fits {fits.name}, as run finds: "
                 f"fragprune check {above.root}"
             )
     return ""
 
 
-def _conclusion(repo: HostRepo, fitting: list[Attempt]) -> str:
+def _conclusion(repo: HostRepo, fitting: Collection[HostAdapter]) -> str:
     if len(fitting) == 1:
-        return f"Use: {usage(fitting[0].adapter, repo)}"
+        return f"Use: {usage(next(iter(fitting)), repo)}"
     if fitting:
-        names = ", ".join(each.adapter.name for each in fitting)
+        names = ", ".join(each.name for each in fitting)
         return f"Several adapters fit: {names}. Name one with fragprune run --adapter."
     return (
         "To write an adapter: the documentation's page Write an adapter in 30 minutes, or "
@@ -306,27 +300,33 @@ class Verdict:
 
 
 def judge(
-    repo: HostRepo, tried: Sequence[Attempt], adapters: Sequence[HostAdapter], plugins: Plugins
+    repo: HostRepo,
+    tried: Mapping[HostAdapter, Match],
+    adapters: Sequence[HostAdapter],
+    plugins: Plugins,
 ) -> Verdict:
     """Judge a checkout.
 
     Args:
-        tried: the result of each adapter on it, the nearest first.
+        tried: the match of each adapter with it, the nearest first.
         plugins: tell which models it saves, where no adapter fits.
     """
     fitting = closest(tried, adapters)
     if len(fitting) == 1:
-        unproved = _unproved(repo, fitting[0])
-        name = fitting[0].adapter.name
-        return Verdict("fits", f"It fits {name}. Not proved: {unproved}.", unproved, name)
+        ((adapter, match),) = fitting.items()
+        warned = [each.found for each in match.findings if each.level == "warning"]
+        told = "; ".join(filter(None, [*warned, adapter.dialect(repo).unproved(repo)]))
+        unproved = told or "its picture; the rule in its vendored rasterizer is the known one"
+        sentence = f"It fits {adapter.name}. Not proved: {unproved}."
+        return Verdict("fits", sentence, unproved, adapter.name)
     if fitting:
-        names = ", ".join(each.adapter.name for each in fitting)
+        names = ", ".join(each.name for each in fitting)
         return Verdict("several", f"Several adapters fit: {names}. Name one with --adapter.")
     own, *others = models_of(repo, plugins)
     inside = _inside(repo, others, adapters)
-    nearest = next((each for each in tried if each.held), None)
-    name = nearest.adapter.name if nearest else ""
-    differs = differences(repo, nearest, own.elsewhere) if nearest else ()
+    nearest = next((each for each, match in tried.items() if match.held), None)
+    name = nearest.name if nearest else ""
+    differs = differences(repo, tried[nearest], own.elsewhere) if nearest else ()
     plain = own
     if not own.model and not inside:
         found = [each for each in others if each.model]
@@ -351,8 +351,8 @@ def judge(
             for folder, fits in inside
         )
         return Verdict("inside", sentence, own.reasons[0], name, differs, inside)
-    if nearest and nearest.held == nearest.looked_up and nearest.adapter.installed:
-        package = nearest.adapter.installed[0]
+    if nearest and nearest.installed and tried[nearest].held == tried[nearest].looked_up:
+        package = nearest.installed[0]
         reason = f"its source is trained with once it is installed, as {package}"
         sentence = f"Not here: {reason}. pip install {repo.root}; fragprune check {package}"
         return Verdict("never", sentence, reason, name, differs)
@@ -360,14 +360,7 @@ def judge(
     return Verdict("never", f"Not possible: {reason}.", reason, name, differs)
 
 
-def _unproved(repo: HostRepo, fitting: Attempt) -> str:
-    """What reading cannot show about a host that fits."""
-    warned = [each.found for each in fitting.match.findings if each.level == "warning"]
-    told = "; ".join(filter(None, [*warned, fitting.adapter.dialect(repo).unproved(repo)]))
-    return told or "its picture; the rule in its vendored rasterizer is the known one"
-
-
-def differences(repo: HostRepo, tried: Attempt, elsewhere: str) -> tuple[str, ...]:
+def differences(repo: HostRepo, match: Match, elsewhere: str) -> tuple[str, ...]:
     """How a checkout differs from an adapter's host, in short lines.
 
     Args:
@@ -375,7 +368,7 @@ def differences(repo: HostRepo, tried: Attempt, elsewhere: str) -> tuple[str, ..
     """
     lines: dict[str, None] = {elsewhere: None} if elsewhere else {}
     missing: list[str] = []
-    for finding in tried.errors:
+    for finding in match.errors:
         if finding.code == "seam-missing":
             missing.append(finding.where.split(" (")[0].split(":")[-1])
         else:
@@ -408,5 +401,5 @@ def _inside(
     found = []
     for each in others:
         tried = attempt(HostRepo(repo.root / each.folder), adapters)
-        found += [(each.folder, one.adapter.name) for one in closest(tried, adapters)[:1]]
+        found += [(each.folder, fits.name) for fits in [*closest(tried, adapters)][:1]]
     return tuple(found)

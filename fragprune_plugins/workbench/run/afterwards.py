@@ -102,7 +102,7 @@ def unserved(command: Sequence[str]) -> Unserved | None:
     if own is None or (models and own.model not in models):  # another may save other columns
         return None
     tried = attempt(repo, plugins.adapters)
-    if any(each.match.fits for each in tried):
+    if any(match.fits for match in tried.values()):
         return None
     program = ("-m", module) if module else (str(script),)
     parser = Flags(add_help=False, allow_abbrev=False)
@@ -113,7 +113,7 @@ def unserved(command: Sequence[str]) -> Unserved | None:
     parser.add_argument("-w", "--white_background", action="store_true")
     flags = vars(parser.parse_known_args(arguments)[0])
     photographs = told_by(flags) if flags["source_path"] else None
-    why = tried[0].brief() if tried else "none is installed"
+    why = next(iter(tried.values())).brief() if tried else "none is installed"
     output = flags["model_path"]
     return Unserved(program, tuple(arguments), output, photographs, why, own.unlike)
 
