@@ -6,8 +6,7 @@ import ast
 import re
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
-from weakref import WeakKeyDictionary
+from functools import cached_property, lru_cache, partial
 
 import fragprune_graphdeco as graphdeco
 from fragprune_3dgs_fork.rasterizer import (
@@ -69,73 +68,43 @@ _PROVABLE = re.compile(r"^(?!.*(median|max|normal|var|dist)).*(depth|alpha|acc|o
 
 @dataclass(frozen=True)
 class Draw:
-    """A drawing function that a training script reaches.
-
-    Attributes:
-        camera: its parameter with the camera.
-        model: its parameter with the model.
-        calls: of a rasterizer, in source order.
-    """
+    """A drawing function that a training script reaches, and its parameters of these kinds."""
 
     function: str
     camera: str
     model: str
-    calls: tuple[graphdeco.CallInSource, ...]
+    calls: tuple[graphdeco.CallInSource, ...]  # of a rasterizer, in source order
 
 
 @dataclass
 class Fork:
-    """What was read of a checkout.
-
-    Attributes:
-        findings: errors, why it cannot be served; warnings, what is not proved.
-        scripts: training scripts, the usual one first.
-        unserved: the others that train such a model, with the reason.
-        draws: the drawing functions that these reach.
-        outputs: by package, what its rasterizer returns.
-        still: methods of the model that scripts call, and that change it.
-        answering: those whose result they read, while they densify.
-        setups: methods that make the optimizer.
-        blended: by package, the argument with channels that are blended beside the colours.
-        options: off by default, under which scripts draw by other functions, change the model or
-            read a value whose meaning is unknown.
-        off: settings and arguments of the rasterizer that are None or False by default.
-        scaled: settings that change the gradient on the screen alone, in its backward pass.
-        asking: settings without which a rasterizer leaves out the channels beside the colours.
-        one_run: why a script cannot resume its own training; "" if all of them can.
-        screens: arguments besides means2D that get a gradient on the screen.
-        colours: options, off by default, under which a network makes the colours.
-        noisy: whether scripts move positions by noise, as large as their rate.
-    """
+    """What was read of a checkout."""
 
     repo: HostRepo
-    findings: list[Finding] = field(default_factory=list)
-    scripts: tuple[str, ...] = ()
-    unserved: dict[str, str] = field(default_factory=dict)
+    findings: list[Finding] = field(default_factory=list)  # errors: why it cannot be served
+    scripts: tuple[str, ...] = ()  # that train, the usual one first
+    unserved: dict[str, str] = field(default_factory=dict)  # others that do, with the reason
     draws: tuple[Draw, ...] = ()
-    outputs: dict[str, tuple[Output, ...]] = field(default_factory=dict)
-    still: tuple[str, ...] = ()
-    answering: frozenset[str] = frozenset()
-    setups: tuple[str, ...] = ()
+    outputs: dict[str, tuple[Output, ...]] = field(default_factory=dict)  # by rasterizer's package
+    still: tuple[str, ...] = ()  # methods of the model that scripts call, and that change it
+    answering: frozenset[str] = frozenset()  # those whose result they read, while they densify
+    setups: tuple[str, ...] = ()  # methods that make the optimizer
+    # by package, the argument with channels that are blended beside the colours
     blended: dict[str, str] = field(default_factory=dict)
+    # off by default: scripts then draw by other functions, change the model, or read unknown values
     options: frozenset[str] = frozenset()
-    off: frozenset[str] = frozenset()
-    scaled: frozenset[str] = frozenset()
-    asking: frozenset[str] = frozenset()
-    one_run: str = ""
-    screens: frozenset[str] = frozenset()
-    colours: frozenset[str] = frozenset()
-    noisy: bool = False
+    off: frozenset[str] = frozenset()  # what rasterizers take that is None or False by default
+    scaled: frozenset[str] = frozenset()  # settings that change the gradient on the screen alone
+    asking: frozenset[str] = frozenset()  # settings without which no channels are blended
+    one_run: str = ""  # why a script cannot resume its own training; "" if all of them can
+    screens: frozenset[str] = frozenset()  # arguments that get a gradient on the screen, too
+    colours: frozenset[str] = frozenset()  # options, off by default, by which networks colour
+    noisy: bool = False  # scripts move positions by noise, as large as their rate
 
     def warn(self, code: str, where: str, found: str) -> None:
         """Add a warning, once for all places."""
         if all(each.found != found for each in self.findings):
             self.findings.append(Finding("warning", code, where, found))
-
-    @property
-    def options_in(self) -> tuple[str, ...]:
-        """The modules that give options and attributes of the model their defaults."""
-        return (MODEL, *self.command)
 
     @property
     def command(self) -> tuple[str, ...]:
@@ -153,7 +122,8 @@ class Fork:
 
     def is_off(self, name: str) -> bool:
         """Whether an option or an attribute of the model is None or False by default."""
-        given = [e for each in self.options_in for e in reading.defaults(self.repo, each, name)]
+        modules = (MODEL, *self.command)
+        given = [e for each in modules for e in reading.defaults(self.repo, each, name)]
         return bool(given) and all(map(is_off, given))
 
     def refuse(self, code: str, where: str, found: str, expected: str) -> None:
@@ -193,12 +163,12 @@ class Fork:
 
         Without those that a run sets, or the checkout itself, as it may all of them from a file.
         """
-        own = [tree for name, tree in self.trees.items() if name.split(".")[0] != "arguments"]
-        pairs = [pair for each in own for pair in assigned(each)]
-        made = _SET | {to.attr for to, _ in pairs if isinstance(to, ast.Attribute)}
         found: dict[ast.AST, frozenset[str]] = {}
         if any("setattr(" in text_of(self.tree(each)) for each in self.scripts):
             return found
+        own = (tree for name, tree in self.trees.items() if name.split(".")[0] != "arguments")
+        pairs = (pair for each in own for pair in assigned(each))
+        made = _SET | {to.attr for to, _ in pairs if isinstance(to, ast.Attribute)}
         known = reading.as_options(self.repo, self.command)
         for tree in self.trees.values():
             skipped = reading.skipped(tree, known)
@@ -225,25 +195,19 @@ class Fork:
         return early
 
 
-_known: WeakKeyDictionary[HostRepo, Fork] = WeakKeyDictionary()
-
-
+@lru_cache(maxsize=16)
 def read_fork(repo: HostRepo) -> Fork:
     """Read a checkout, once; of several scripts only those that can be served, if one can."""
-    if repo not in _known:
-        fork = _read(repo, reading.training_scripts(repo, *reading.SCRIPTS, "*/*train*.py"))
-        if fork.errors and len(fork.scripts) > 1:
-            alone = {script: _read(repo, (script,)) for script in fork.scripts}
-            if served := tuple(script for script, each in alone.items() if not each.errors):
-                refused = {
-                    name: each.errors[0].found for name, each in alone.items() if each.errors
-                }
-                unserved, fork = fork.unserved | refused, _read(repo, served)
-                fork.unserved = unserved
-        for script, why in fork.unserved.items() if fork.scripts else ():
-            fork.warn("script", script, f"{script}, which is not served: {why}")
-        _known[repo] = fork
-    return _known[repo]
+    fork = _read(repo, reading.training_scripts(repo, *reading.SCRIPTS, "*/*train*.py"))
+    if fork.errors and len(fork.scripts) > 1:
+        alone = {script: _read(repo, (script,)) for script in fork.scripts}
+        refused = {name: each.errors[0].found for name, each in alone.items() if each.errors}
+        if served := tuple(script for script in alone if script not in refused):
+            unserved, fork = fork.unserved | refused, _read(repo, served)
+            fork.unserved = unserved
+    for script, why in fork.unserved.items() if fork.scripts else ():
+        fork.warn("script", script, f"{script}, which is not served: {why}")
+    return fork
 
 
 def _read(repo: HostRepo, scripts: tuple[str, ...]) -> Fork:
@@ -300,21 +264,19 @@ def _networks(repo: HostRepo, script: str) -> set[str]:
 
 def _check_script(fork: Fork, script: str) -> None:
     """A script trains in this process, and goes backward once in an iteration."""
-    tree = fork.tree(script)
+    tree, refuse = fork.tree(script), partial(fork.refuse, "script", script)
     if _PROCESSES.search(text_of(tree)):
-        found = "it trains in processes of its own"
-        fork.refuse("script", script, found, "one process that keeps its files")
+        refuse("it trains in processes of its own", "one process that keeps its files")
     owners = "|".join(map(re.escape, sorted(reading.owners(tree)))) or "-"
     if copied := re.search(rf"\bdeepcopy\(({owners})\)", text_of(tree)):
-        fork.refuse("script", script, f"copies its model, {copied[0]}", "the one that it makes")
+        refuse(f"copies its model, {copied[0]}", "the one that it makes")
     if size := _size(fork.repo, script):
         found = f"draws pictures of another size than the camera's, {size}"
-        expected = "the camera's: stage 2 would begin with the first of its sizes again"
-        fork.refuse("script", script, found, expected)
+        refuse(found, "the camera's: stage 2 would begin with the first of its sizes again")
     if several := _trainings(fork, reading.module_of(script)):
-        fork.refuse("script", script, *several)
+        refuse(*several)
     if until := _rests(tree):
-        fork.refuse("script", script, f"its optimizer steps only where {until}", "to its end")
+        refuse(f"its optimizer steps only where {until}", "to its end")
     loops = [
         loop
         for loop in every(tree, ast.For)
@@ -322,7 +284,7 @@ def _check_script(fork: Fork, script: str) -> None:
     ]
     counted = [each for each in loops if "iterations" in text_of(each.iter)]
     if any(each in nodes(outer)[1:] for each in counted for outer in loops):
-        fork.refuse("script", script, "a training in a loop", "one training")
+        refuse("a training in a loop", "one training")
     fork.one_run = fork.one_run or next(_not_resumed(fork.repo, script, tree), "")
 
 
@@ -457,12 +419,12 @@ def _not_resumed(repo: HostRepo, script: str, tree: ast.Module) -> Iterator[str]
     if taken and not any(n >= len(fixed) if more else n == len(fixed) for n in taken):
         yield f"its restore takes {taken[0]} values, and capture gives {len(state)}"
     whole = re.findall(r"self\.(\w+)(?=[,)])", text_of(capture))
-    trained = re.findall(r"self\.(\w+)\.parameters\(", text_of(repo.tree(MODEL) or ast.Pass()))
+    trained = re.findall(r"self\.(\w+)\.parameters\(", text_of(repo.tree(MODEL)))
     if networks := sorted({*whole} & {*trained}):
         yield f"its checkpoints hold whole networks, {', '.join(networks)}"
     if networks := sorted({*trained} - _mentioned(capture)):
         yield f"its checkpoints lack networks, {', '.join(networks)}"
-    setup = text_of(methods.get("training_setup", ast.Pass()))
+    setup = text_of(methods.get("training_setup"))
     values = re.findall(r"'params': \[self\.(\w+)\]", setup)
     if lacking := sorted({*values} - _mentioned(capture)):
         yield f"its checkpoints lack {', '.join(lacking)}"
@@ -696,8 +658,7 @@ def read_getters(fork: Fork) -> list[Finding]:
         for target, value in assigned(tree)
         if isinstance(target, ast.Attribute) and not is_off(value)
     }
-    unset = reading.unset(fork.repo, MODEL, CLASS) - made
-    return reading.read_getters(fork.repo, MODEL, unset)
+    return reading.read_getters(fork.repo, reading.unset(reading.ModelClass(fork.repo)) - made)
 
 
 # -- draws -----------------------------------------------------------------------------------------
@@ -705,10 +666,10 @@ def read_getters(fork: Fork) -> list[Finding]:
 
 def _read_draws(fork: Fork) -> None:
     """The drawing functions that a script names, and their calls."""
-    functions = fork.drawing
+    functions, repo = fork.drawing, fork.repo
     drawing = [each for each in fork.trees.values() if not _mentioned(each).isdisjoint(functions)]
     named = {name for tree in drawing for name in _reached(fork, tree)}
-    pairs = ((name, fork.repo.function(RENDERER, name)) for name in functions)
+    pairs = ((name, repo.function(RENDERER, name)) for name in functions)
     drawn = {name: body for name, body in pairs if body}
     while more := {n for name in drawn.keys() & named for n in _mentioned(drawn[name])} - named:
         named |= more
@@ -716,44 +677,40 @@ def _read_draws(fork: Fork) -> None:
     trees = (*fork.trees.values(), *bodies.values())
     called = {getattr(n, "id", getattr(n, "attr", "")) for each in trees for n in nodes(each)}
     for name, body in bodies.items():
-        parameters = fork.repo.parameters(RENDERER, name) or ()
+        parameters = repo.parameters(RENDERER, name) or ()
         model = next((each for each in _MODEL_ARGUMENTS if each in parameters), "")
-        at = f"{RENDERER}:{name} ({fork.repo.place(RENDERER, name)})"
-        calls = tuple(graphdeco.read_calls(fork.repo, RENDERER, name))
+        at = f"{RENDERER}:{name} ({repo.place(RENDERER, name)})"
+        refuse = partial(fork.refuse, "rasterizer-call", at)
+        calls = tuple(graphdeco.read_calls(repo, RENDERER, name))
         others = [each for each in parameters if each != model]
         camera = next((each for each in others if _CAMERA.match(each)), next(iter(others), ""))
         if not model or not camera or parameters.index(model) < parameters.index(camera):
-            found = f"arguments {', '.join(parameters)}"
-            fork.refuse("rasterizer-call", at, found, "a camera and a model")
+            refuse(f"arguments {', '.join(parameters)}", "a camera and a model")
             continue
         if not calls or not all(call.names for call in calls):
-            fork.refuse("rasterizer-call", at, "a result that is not unpacked", "its values")
+            refuse("a result that is not unpacked", "its values")
             continue
         fork.draws += (Draw(name, camera, model, calls),)
-        source = plain.Drawing(fork.repo, RENDERER, body)
+        source = plain.Drawing(repo, RENDERER, body)
+        filled = {getattr(each.value, "id", "") for each in every(body, ast.Subscript)}
         for call in calls:
             _check_call(fork, at, name, call)
-            blended = call.given.get(fork.blended.get(call.package, ""))
-            made = source.values.get(getattr(blended, "id", ""), [])
-            filled = {getattr(each.value, "id", "") for each in every(body, ast.Subscript)}
-            if getattr(blended, "id", "") not in filled and any(
-                re.search(r"torch\.(zeros|empty)\(", text_of(each)) for each in made
-            ):
-                found = f"{text_of(blended or ast.Pass())}, which is empty unless asked for"
-                fork.refuse("rasterizer-call", at, found, "channels of every Gaussian")
-        for node in nodes(body) if name in called else ():
-            if isinstance(node, ast.Call) and "means3D" in plain.arguments(node):
-                other = plain.Drawing(fork.repo, RENDERER, body, call=node)
+            blended = text_of(call.given.get(fork.blended.get(call.package, "")))
+            made = " ".join(map(text_of, source.values.get(blended, [])))
+            if blended not in filled and re.search(r"torch\.(zeros|empty)\(", made):
+                refuse(f"{blended}, which is empty unless asked for", "channels of every Gaussian")
+        for node in every(body, ast.Call) if name in called else ():
+            if "means3D" in plain.arguments(node):
+                other = plain.Drawing(repo, RENDERER, body, call=node)
                 for found in (why for why, moves in other.shapes() if not moves):
-                    fork.refuse("rasterizer-call", at, found, "the model's own Gaussians")
+                    refuse(found, "the model's own Gaussians")
         for cut in [*source.cuts()][:1]:
-            found = f"a picture of more channels, {text_of(cut)}"
-            fork.refuse("rasterizer-call", at, found, "a picture")
+            refuse(f"a picture of more channels, {text_of(cut)}", "a picture")
         if selected := source.selection():
-            fork.refuse("rasterizer-call", at, f"draws a selection, {selected}", "all rows")
+            refuse(f"draws a selection, {selected}", "all rows")
         fork.colours |= source.colours
     if not fork.draws and not any(each.code == "rasterizer-call" for each in fork.findings):
-        at = f"{RENDERER} ({fork.repo.place(RENDERER, 'render')})"
+        at = f"{RENDERER} ({repo.place(RENDERER, 'render')})"
         fork.refuse("rasterizer-call", at, "no drawing function that a script calls", "render")
 
 
@@ -820,22 +777,17 @@ def _stays_off(fork: Fork, function: str, value: ast.expr | None) -> bool:
 
 def _read_outputs(fork: Fork) -> None:
     """What each rasterizer returns; refused where a value is read and its meaning is unknown."""
-    for draw in fork.draws:
-        for call in draw.calls:
-            package = call.package
-            roles = tuple(_output(fork, draw, call, number) for number in range(len(call.names)))
-            known = fork.outputs.get(package)
-            if known is not None and len(known) != len(roles):
-                at, found = (
-                    fork.repo.at(RENDERER, call.line),
-                    f"{len(roles)} and {len(known)} values",
-                )
-                fork.refuse("rasterizer-call", at, found, "one form")
-                continue
-            fork.outputs[package] = tuple(
-                each if each.role != "unread" else former
-                for each, former in zip(roles, known or roles, strict=True)
-            )
+    for draw, call in ((each, call) for each in fork.draws for call in each.calls):
+        roles = tuple(_output(fork, draw, call, number) for number in range(len(call.names)))
+        known = fork.outputs.get(call.package, roles)
+        if len(known) != len(roles):
+            at, found = fork.repo.at(RENDERER, call.line), f"{len(roles)} and {len(known)} values"
+            fork.refuse("rasterizer-call", at, found, "one form")
+            continue
+        fork.outputs[call.package] = tuple(
+            each if each.role != "unread" else former
+            for each, former in zip(roles, known, strict=True)
+        )
     for package, roles in fork.outputs.items():
         names = [each.role for each in roles]
         if names[:1] != ["image"] or names.count("radii") != 1:

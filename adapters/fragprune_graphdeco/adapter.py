@@ -299,7 +299,7 @@ class GraphdecoAdapter(ScriptAdapter):
         return [
             *self.other_host(repo, missing),
             *(each for name in packages for each in read_kernels(repo, name, self.kernel)),
-            *read_getters(repo, MODEL),
+            *read_getters(repo),
             *(read_flags(repo, self.command_line(repo)) if repo.tree(MODEL) else ()),
             *self._groups(repo),
             *self._calls(repo),
@@ -556,8 +556,7 @@ def _opaque(repo: HostRepo, scene: Path) -> bool:
 
     Readers of Blender's scenes composite images, but not those that loadCam opens once more.
     """
-    tree = repo.tree(CAMERAS)
-    code = text_of(tree) if tree else ""
+    code = text_of(repo.tree(CAMERAS))
     read = "Image.open(" in code or not (scene / "transforms_train.json").exists()
     return read and "shape[0] == 4" not in code
 

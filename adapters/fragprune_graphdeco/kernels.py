@@ -10,9 +10,9 @@ import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Literal
-from weakref import WeakKeyDictionary
 
 from fragprune_plugins.adapting import Finding, HostRepo, nodes
 
@@ -80,17 +80,13 @@ def read_kernels(repo: HostRepo, package: str, kernel: Kernel) -> list[Finding]:
         An error for each difference; a warning where an exponent cannot be read. Empty if the
         checkout vendors no such package.
     """
-    found: list[Finding] = []
-    for project in _projects(repo, package):
-        found += project.compare(kernel)
-    return found
+    return [each for project in _projects(repo, package) for each in project.compare(kernel)]
 
 
 def normal_sources(repo: HostRepo, package: str) -> list[str]:
     """The CUDA sources of a vendored rasterizer that draw, in one spelling; empty without any."""
-    return [
-        _normal(text) for project in _projects(repo, package) for text in project.texts.values()
-    ]
+    texts = (text for project in _projects(repo, package) for text in project.texts.values())
+    return [*map(_normal, texts)]
 
 
 def backward_sources(repo: HostRepo, package: str) -> str:
@@ -99,15 +95,9 @@ def backward_sources(repo: HostRepo, package: str) -> str:
     return "".join(_normal(_COMMENT.sub("", repo.read(path))) for path in files)
 
 
-_read: WeakKeyDictionary[HostRepo, dict[str, list[_Project]]] = WeakKeyDictionary()
-
-
-def _projects(repo: HostRepo, package: str) -> list[_Project]:
-    """The vendored projects of a package; read once for all adapters."""
-    known = _read.setdefault(repo, {})
-    if package not in known:
-        known[package] = [_Project(repo, each, package) for each in vendored(repo, package)]
-    return known[package]
+@lru_cache(maxsize=64)  # of the adapters, many ask
+def _projects(repo: HostRepo, package: str) -> tuple[_Project, ...]:
+    return tuple(_Project(repo, each, package) for each in vendored(repo, package))
 
 
 def vendored(repo: HostRepo, package: str) -> list[Path]:
@@ -204,7 +194,8 @@ class _Project:
                     yield replace(finding, code=ORDER)
 
     def _alphas(self, kernel: Kernel) -> Iterator[Finding]:
-        drawn, known, unread = self._launched(), 0, []
+        texts, known, unread = self.texts.values(), 0, []
+        launched = {match[1] for text in texts for match in _LAUNCH.finditer(text)}
         for path, position, text in self._found(_ALPHA):
             if re.fullmatch(r"[\d.]+", text):  # a start, which the code below it changes
                 continue
@@ -215,7 +206,8 @@ class _Project:
                 what = "no exp()" if exponent is None else "not capped at 0.99"
                 yield self._finding(path, position, f"alpha = {_short(text)}: {what}", kernel.says)
             elif kernel.exponent.fullmatch(exponent):
-                known += not drawn or self._function(path, position) in drawn
+                names = [each[1] for each in _KERNEL.finditer(self.texts[path], 0, position)]
+                known += not launched or bool(launched.intersection(names[-1:]))
             else:
                 unread.append((path, position, exponent))
         for path, position, exponent in unread:
@@ -223,20 +215,11 @@ class _Project:
             other = not known and not (kernel.projected and _POLYNOMIAL.fullmatch(exponent))
             yield self._finding(path, position, what, kernel.says, error=other)
         if not known and not unread:
-            others = [each for each in self._found(_BRANCHES) if "exp(" not in each[2]]
-            path, position, text = next(iter(others), (self.folder, 0, ""))
+            others = (each for each in self._found(_BRANCHES) if "exp(" not in each[2])
+            path, position, text = next(others, (self.folder, 0, ""))
             absent = "no alpha = min(0.99, opacity exp())"
             what = f"alpha = {_short(text)}: no exp()" if text else absent
             yield self._finding(path, position, what, kernel.says)
-
-    def _launched(self) -> set[str]:
-        """Names of the kernels that the sources launch."""
-        return {match[1] for text in self.texts.values() for match in _LAUNCH.finditer(text)}
-
-    def _function(self, path: Path, position: int) -> str:
-        """The kernel that contains a position, or the last one before it."""
-        names = [match[1] for match in _KERNEL.finditer(self.texts[path], 0, position)]
-        return names[-1] if names else ""
 
     def _exponent(self, path: Path, position: int, text: str) -> str | None:
         """The exponent of an alpha, with the variables that it goes through; None without exp."""
@@ -254,9 +237,9 @@ class _Project:
             return None
         declared = re.compile(rf"\b(?:float|auto)\s+{name}\s*=([^;]+);")
         before = [
-            value for where, at, value in self._found(declared) if where == path and at < position
+            each[1] for each in declared.finditer(self.texts[path]) if each.start() < position
         ]
-        return before[-1] if before else None
+        return _normal(before[-1]) if before else None
 
     def _filters(self) -> Iterator[Finding]:
         added = list(self._found(_FILTER))

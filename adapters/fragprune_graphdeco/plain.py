@@ -12,7 +12,6 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from weakref import WeakKeyDictionary
 
 from fragprune_graphdeco import reading
 from fragprune_graphdeco.call import ARGUMENTS, RASTERIZER, read_calls
@@ -21,6 +20,7 @@ from fragprune_graphdeco.photographs import unlike
 from fragprune_graphdeco.reading import (
     ACTIVATIONS,
     Known,
+    ModelClass,
     assigned,
     decided,
     defaults,
@@ -76,6 +76,7 @@ _GSPLAT = {
 _USUAL = {"rasterize_mode": "classic", "camera_model": "pinhole", "eps2d": 0.3}
 """Arguments of it that change the picture, and the values with which it draws as 3DGS does."""
 _SAVES = re.compile(r"\.save_ply\w*\(|scene\w*\.save\(")
+_LISTS = "construct_list_of_attributes"
 _ABSENT = "no model of this family that saves a PLY was found"
 _UNSAVED = "none of its scripts saves a PLY"
 
@@ -98,81 +99,71 @@ def read_models(repo: HostRepo) -> list[Plain]:
     return [own, *models]
 
 
-_known: WeakKeyDictionary[HostRepo, Plain] = WeakKeyDictionary()
-
-
+@lru_cache(maxsize=16)
 def read_plain(repo: HostRepo) -> Plain:
     """Read a checkout's model, its save function, its drawing function and its kernel, once."""
-    if repo not in _known:
-        _known[repo] = _read_plain(repo)
-    return _known[repo]
-
-
-def _read_plain(repo: HostRepo) -> Plain:
-    module, name = next(_models(repo), ("", ""))
-    if not module:
-        own = dict(_of_drawing(repo, _own_renderers(repo)))
-        return Plain((*own, _without(repo)))
-    flat = list(_scales(repo, module, name))
-    moving = dict([*_of_drawing(repo, _renderers(repo)), *_moved(repo, repo)])
-    drawn = list(moving)
-    made = [each for each in drawn if "3D_filter" not in each]
-    moving |= (getters := dict(_of_getters(repo, module, name)))
+    model = next(_models(repo), None)
+    if model is None:
+        return Plain((*dict(_of_drawing(repo, _own_renderers(repo))), _without(repo)))
+    flat, getters = list(_scales(model)), dict(_of_getters(model))
+    drawn = dict([*_of_drawing(repo, _renderers(repo)), *_moved(repo, repo)])
     reasons = [
         *flat,
-        *made,
+        *(each for each in drawn if "3D_filter" not in each),
         *getters,
-        *_of_columns(repo, module, name),
+        *_of_columns(model),
         *(() if flat else _of_kernel(repo)),
         *drawn,
-        *_of_saving(repo, module, name),
-        *_of_positions(repo, module, name),
-        *_of_others(repo, module, name),
+        *_of_saving(model),
+        *_of_positions(model),
+        *_of_others(model),
         *_of_scripts(repo),
-        *_of_makers(repo, module, name),
+        *_of_makers(model),
     ]
-    moved = frozenset(each for each, moves in moving.items() if moves)
-    elsewhere = "" if module == reading.MODEL else f"{name} is in {module}"
+    moved = frozenset(each for each, moves in (drawn | getters).items() if moves)
+    elsewhere = "" if model.module == reading.MODEL else f"{model.name} is in {model.module}"
     differs = unlike(repo, _training(repo)) if not reasons else ""
-    return Plain(tuple(dict.fromkeys(reasons)), name, moved, "", elsewhere, differs)
+    return Plain(tuple(dict.fromkeys(reasons)), model.name, moved, "", elsewhere, differs)
 
 
 def _without(repo: HostRepo) -> str:
     """Why no model was found that saves a PLY."""
-    module = reading.MODEL
-    if repo.path(module) and repo.tree(module) is None:
+    model = ModelClass(repo)
+    if repo.path(model.module) and repo.tree(model.module) is None:
         return "its scene/gaussian_model.py is no valid Python"
-    if repo.function(module, "GaussianModel.__init__"):
-        return f"its GaussianModel has no save_ply ({repo.place(module, 'GaussianModel')})"
+    if model.method("__init__"):
+        return f"its GaussianModel has no save_ply ({repo.place(model.module, model.name)})"
     paths = re.findall(r"^\s*path = (\S+)", repo.read(repo.root / ".gitmodules"), re.MULTILINE)
     absent = [each for each in paths if not any((repo.root / each).glob("*"))]
     beside = f"; its submodules are not in the checkout: {', '.join(absent)}" if absent else ""
     return f"{_ABSENT}{beside}"
 
 
-def _models(repo: HostRepo) -> Iterator[tuple[str, str]]:
-    """Module and class of each model that saves a PLY, the one that ``scene`` exports first: those
-    in ``scene``, or else those that a script trains.
+def _models(repo: HostRepo) -> Iterator[ModelClass]:
+    """The models that save a PLY, the one that ``scene`` exports first: those in ``scene``, or else
+    those that a script trains.
     """
     home = reading.home_of(repo, "scene").removeprefix("scene.")
     stems = [each.stem for each in (repo.root / "scene").glob("*.py") if each.stem.isidentifier()]
     stems.sort(key=lambda s: (s != home, "gaussian" not in s, "model" not in s, len(s), s))
-    own = [f"scene.{each}" for each in stems]
-    found = [*_saving(repo, own, "save_ply")]
+    found = [*_saving(repo, [f"scene.{each}" for each in stems], "save_ply")]
     trained = _trained(repo) if not found else []
     setups = [*_saving(repo, trained, "save_ply", "training_setup")]
     yield from found or setups or _saving(repo, trained, "save_ply", "get_xyz")
 
 
-def _saving(repo: HostRepo, modules: Iterable[str], *methods: str) -> Iterator[tuple[str, str]]:
-    """Module and name of each class with these methods that lists the columns of a PLY."""
+def _saving(repo: HostRepo, modules: Iterable[str], *methods: str) -> Iterator[ModelClass]:
+    """Each class with these methods that lists the columns of a PLY."""
     for module in modules:
         body = getattr(repo.tree(module), "body", ())
         classes = [each for each in body if isinstance(each, ast.ClassDef)]
         for each in sorted(classes, key=lambda each: each.name != "GaussianModel"):
-            own = {getattr(node, "name", "") for node in each.body}
-            if own.issuperset(methods) and _columns(repo, module, each.name)[1]:
-                yield module, each.name
+            own, model = (
+                {getattr(n, "name", "") for n in each.body},
+                ModelClass(repo, module, each.name),
+            )
+            if own.issuperset(methods) and _columns(model)[1]:
+                yield model
 
 
 def _trained(repo: HostRepo) -> list[str]:
@@ -181,33 +172,32 @@ def _trained(repo: HostRepo) -> list[str]:
     return [*reading.reached(repo, [*_training(repo), *deeper])]
 
 
-def _of_others(repo: HostRepo, module: str, model: str) -> Iterator[str]:
+def _of_others(model: ModelClass) -> Iterator[str]:
     """Other models that training scripts make, if none makes the model alone, with columns that
     change the picture.
     """
-    scripts = _training(repo)
-    with_model = [each for each in scripts if repo.mentions([each], [model])]
-    for other, name in _models(repo):
-        alone = name != model and any(not repo.mentions([each], [name]) for each in with_model)
-        if other != module and not alone and repo.mentions(scripts, [name]):
-            at = repo.place(other, f"{name}.construct_list_of_attributes")
-            _, names = _columns(repo, other, name)
-            own = [each for each in names if each not in _PLAIN]
-            whole = all(any(each.startswith(column) for each in names) for column in _COLUMNS)
-            for each in own:
-                says = change_of(each)
-                if says or whole:  # if not whole, it is no model that makes a picture
-                    what = f"{each}, {says}" if says else each
-                    yield f"{name}, which a script here trains: its PLY also holds {what} ({at})"
-            computed = (*_of_saving(repo, other, name), *dict(_of_getters(repo, other, name)))
-            for reason in computed if whole else ():
-                yield f"{name}, which a script here trains: {reason}"
+    repo, scripts = model.repo, _training(model.repo)
+    with_model = [each for each in scripts if repo.mentions([each], [model.name])]
+    for other in _models(repo):
+        differs = other.name != model.name
+        alone = differs and any(not repo.mentions([each], [other.name]) for each in with_model)
+        if other.module == model.module or alone or not repo.mentions(scripts, [other.name]):
+            continue
+        trained, names = f"{other.name}, which a script here trains:", _columns(other)[1]
+        whole = all(any(each.startswith(column) for each in names) for column in _COLUMNS)
+        for each in (name for name in names if name not in _PLAIN):
+            says = change_of(each)
+            if says or whole:  # if not whole, it is no model that makes a picture
+                what, at = f"{each}, {says}" if says else each, other.at(_LISTS)
+                yield f"{trained} its PLY also holds {what} ({at})"
+        if whole:
+            for reason in (*_of_saving(other), *dict(_of_getters(other))):
+                yield f"{trained} {reason}"
 
 
-def _columns(repo: HostRepo, module: str, name: str) -> tuple[Function | None, list[str]]:
+def _columns(model: ModelClass) -> tuple[Function | None, list[str]]:
     """The function that lists a PLY's columns, and their names without numbers."""
-    listed = repo.function(module, f"{name}.construct_list_of_attributes")
-    listed = listed or repo.function(module, f"{name}.save_ply")
+    listed = model.method(_LISTS) or model.method("save_ply")
     names = dict.fromkeys(
         re.sub(r"_?(\{\})?\d*$", "", node.value)
         for node in every(listed, ast.Constant)
@@ -216,10 +206,9 @@ def _columns(repo: HostRepo, module: str, name: str) -> tuple[Function | None, l
     return listed, [each for each in names if each.isidentifier()]
 
 
-def _of_columns(repo: HostRepo, module: str, name: str) -> Iterator[str]:
+def _of_columns(model: ModelClass) -> Iterator[str]:
     """Columns that are missing, or that plain 3DGS does not have."""
-    listed, names = _columns(repo, module, name)
-    at = repo.place(module, f"{name}.construct_list_of_attributes")
+    (listed, names), at = _columns(model), model.at(_LISTS)
     if missing := [each for each in _COLUMNS if not any(n.startswith(each) for n in names)]:
         yield f"its PLY lacks the columns {', '.join(missing)} ({at})"
     if listed is not None and listed.name != "save_ply":
@@ -228,13 +217,15 @@ def _of_columns(repo: HostRepo, module: str, name: str) -> Iterator[str]:
                 yield f"its PLY also holds {each}, {says} ({at})"
 
 
-def _scales(repo: HostRepo, module: str, name: str) -> Iterator[str]:
+def _scales(model: ModelClass) -> Iterator[str]:
     """Gaussians with two scales, or with one."""
-    setup = every(repo.function(module, f"{name}.create_from_pcd"), ast.Assign)
-    body = getattr(repo.tree(module), "body", ())
-    model = (each for each in body if getattr(each, "name", "") == name)
+    repo, module = model.repo, model.module
+    setup = every(model.method("create_from_pcd"), ast.Assign)
+    body = (
+        n for n in getattr(repo.tree(module), "body", ()) if getattr(n, "name", "") == model.name
+    )
     joined = " ".join(re.findall(r"\bcat\([\[(](.*?)[\])]", " ".join(map(text_of, setup))))
-    for each in (node for part in model for node in every(part, ast.Assign)):
+    for each in (node for part in body for node in every(part, ast.Assign)):
         wide = re.search(r"\.repeat\(1, ([12])\)$", text_of(each.value))
         target = text_of(each.targets[0])
         if wide and target not in joined and (each in setup or "scal" in target):
@@ -248,60 +239,54 @@ def _scales(repo: HostRepo, module: str, name: str) -> Iterator[str]:
         yield f"its Gaussians are round, with one scale ({repo.at(module, made[0].lineno)})"
 
 
-def _of_saving(repo: HostRepo, module: str, name: str) -> Iterator[str]:
+def _of_saving(model: ModelClass) -> Iterator[str]:
     """Values that are not saved as they are before activation."""
-    raw = {"scaling": True, "opacity": True}
-    function = repo.function(module, f"{name}.save_ply")
-    for node in every(function, ast.Assign):
+    raw, repo, module = {"scaling": True, "opacity": True}, model.repo, model.module
+    for node in every(model.method("save_ply"), ast.Assign):
         if not isinstance(node.targets[0], ast.Name):
             continue
         target, value = node.targets[0].id, text_of(node.value)
-        at = repo.at(module, node.lineno)
+        shown = f"{value[:60]} ({repo.at(module, node.lineno)})"
         for kind in raw:
             if re.search(rf"self\.get_{kind}\b", value) and not isinstance(node.value, ast.Compare):
                 raw[kind] = False
                 if not re.search(r"inverse|log", value):
-                    yield f"save_ply stores activated values, {target} = {value[:60]} ({at})"
+                    yield f"save_ply stores activated values, {target} = {shown}"
         if target in ("opacities", "scale") and (got := re.match(r"self\.(get_\w+_\w+)", value)):
-            getter = repo.function(module, f"{name}.{got[1]}")
-            stored = {"scale": "_scaling"}.get(target, "_opacity")
+            getter, stored = model.method(got[1]), "_scaling" if target == "scale" else "_opacity"
             if getter is None or returns(getter, stored) != {"stored"}:
-                yield f"save_ply stores other values, {target} = {value[:60]} ({at})"
+                yield f"save_ply stores other values, {target} = {shown}"
         if target in ("f_dc", "f_rest", "opacities", "scale", "rotation"):
             if re.match(r"np\.(zeros|ones)", value):
-                yield f"save_ply stores no {target}: {value[:60]} ({at})"
+                yield f"save_ply stores no {target}: {shown}"
             if re.search(r"self\.\w+ ?[*+/-] ?self\.\w+", value):
-                yield f"save_ply stores a product or sum, {target} = {value[:60]} ({at})"
-    setup = repo.function(module, f"{name}.setup_functions")
-    for node in every(setup, ast.Assign):
+                yield f"save_ply stores a product or sum, {target} = {shown}"
+    for node in every(model.method("setup_functions"), ast.Assign):
         attribute, value = getattr(node.targets[0], "attr", ""), text_of(node.value)
         expected = ACTIVATIONS.get(attribute, (value,))
         if value not in expected and raw.get(attribute.removesuffix("_activation"), True):
             yield f"its {attribute} is {value[:50]} ({repo.at(module, node.lineno)})"
 
 
-def _of_getters(repo: HostRepo, module: str, name: str) -> Iterator[tuple[str, bool]]:
+def _of_getters(model: ModelClass) -> Iterator[tuple[str, bool]]:
     """Getters of other values than the PLY's; true if only where an attribute was set later."""
-    saved = text_of(repo.function(module, f"{name}.save_ply") or ast.Pass())
-    if repo.function(module, f"{name}.get_xyz") is None:  # a class that only saves
-        module, name = reading.MODEL, "GaussianModel"
-    off = reading.unset(repo, module, name)
-    always = reading.computed_getters(repo, module, name, off)
-    options = reading.options(repo, module, name, _training(repo))
-    for kind in reading.computed_getters(repo, module, name, options):
+    saved = text_of(model.method("save_ply"))
+    if model.method("get_xyz") is None:  # a class that only saves
+        model = ModelClass(model.repo)
+    always = reading.computed_getters(model, reading.unset(model))
+    options = reading.options(model, _training(model.repo))
+    for kind in reading.computed_getters(model, options):
         if kind != "xyz" or "self.get_xyz" not in saved:
-            at = repo.place(module, f"{name}.get_{kind}")
-            yield f"get_{kind} is computed ({at})", kind not in always
+            yield f"get_{kind} is computed ({model.at(f'get_{kind}')})", kind not in always
 
 
-def _of_positions(repo: HostRepo, module: str, name: str) -> Iterator[str]:
+def _of_positions(model: ModelClass) -> Iterator[str]:
     """Positions that no optimizer moves: something else makes them for every picture."""
-    setup = repo.function(module, f"{name}.training_setup")
+    setup, created = model.method("training_setup"), text_of(model.method("create_from_pcd"))
     trained = " ".join(map(text_of, reading.entries(setup, "params")))
-    created = text_of(repo.function(module, f"{name}.create_from_pcd") or ast.Pass())
     fixed = re.search(r"self\._xyz = .*requires_grad_\(False\)", created)
     if "self._opacity" in trained and not (fixed or re.search(r"self\._xyz\b", trained)):
-        at = repo.place(module, f"{name}.training_setup")
+        at = model.at("training_setup")
         yield f"its optimizer does not train positions, which are made otherwise ({at})"
 
 
@@ -316,13 +301,13 @@ def _of_scripts(repo: HostRepo) -> Iterator[str]:
         yield from _of_sums(repo, script)
 
 
-def _of_makers(repo: HostRepo, module: str, model: str) -> Iterator[str]:
+def _of_makers(model: ModelClass) -> Iterator[str]:
     """A model that every training script makes in place of the one that was read."""
-    made = {each: name for each in _training(repo) for name in made_models(repo, each)}
-    only_saves = repo.function(module, f"{model}.get_xyz") is None
-    if made and not only_saves and not repo.mentions(_training(repo), [model]):
+    repo, scripts = model.repo, _training(model.repo)
+    made = {each: name for each in scripts for name in made_models(repo, each)}
+    if made and model.method("get_xyz") and not repo.mentions(scripts, [model.name]):
         script, name = next(iter(made.items()))
-        yield f"its PLY was not read: {script}.py trains {name}, not {model}"
+        yield f"its PLY was not read: {script}.py trains {name}, not {model.name}"
 
 
 def _of_sums(repo: HostRepo, script: str) -> Iterator[str]:
@@ -596,10 +581,12 @@ class Drawing:
                 if isinstance(part, ast.expr):
                     yield from self._roots(part)
 
+    def _model(self) -> ModelClass:
+        return ModelClass(self.repo, reading.home_of(self.repo, "scene") or reading.MODEL)
+
     def _given_by(self, name: str) -> list[str]:
         """The attributes of the model that an attribute gives: itself, or what its method does."""
-        home = reading.home_of(self.repo, "scene") or reading.MODEL
-        method = self.repo.function(home, f"GaussianModel.{name}")
+        method = self._model().method(name)
         body = method.body[-1] if method and len(method.body) == 1 else None
         value = body.value if isinstance(body, ast.Return) else None
         given = value.elts if isinstance(value, ast.Tuple) else []
@@ -638,8 +625,7 @@ class Drawing:
 
     def _of_columns(self) -> Iterator[str]:
         """Arguments that further columns of the PLY may be, without channels beside the colours."""
-        home = reading.home_of(self.repo, "scene") or reading.MODEL
-        names = {*_columns(self.repo, home, "GaussianModel")[1]} - _PLAIN
+        names = {*_columns(self._model())[1]} - _PLAIN
         further = {each for each in names if not change_of(each)}
         for name, value in arguments(self.call).items() if further else ():
             if name not in {*ARGUMENTS, *further} and not _CHANNELS.search(name):

@@ -8,6 +8,7 @@ import operator
 import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -42,65 +43,80 @@ _ASKED = re.compile(r"self\.(\w+) is not None")
 _OTHER_FLAGS = ("hydra", "omegaconf", "tyro", "jsonargparse", "fire", "gin", "click", "absl")
 
 
-def read_getters(repo: HostRepo, module: str, unset: Collection[str] = ()) -> list[Finding]:
+@dataclass(frozen=True)
+class ModelClass:
+    """A class of Gaussians in a checkout."""
+
+    repo: HostRepo
+    module: str = MODEL
+    name: str = "GaussianModel"
+
+    def method(self, name: str) -> Function | None:
+        """Its definition."""
+        return self.repo.function(self.module, f"{self.name}.{name}")
+
+    def at(self, name: str) -> str:
+        """The file:line of a method."""
+        return self.repo.place(self.module, f"{self.name}.{name}")
+
+    @property
+    def getters(self) -> dict[str, Function | None]:
+        """By the kinds of values that they give."""
+        return {kind: self.method(f"get_{kind}") for kind in GETTERS}
+
+
+def read_getters(repo: HostRepo, unset: Collection[str] = ()) -> list[Finding]:
     """An error for each getter that is no property, or that gives other than its parameter.
 
     A threshold belongs to a row of the parameters. Attributes in ``unset`` are None.
     """
-    found, computed = [], computed_getters(repo, module, "GaussianModel", unset)
-    for kind in GETTERS if repo.tree(module) else ():  # if not, the seams say so
-        name = f"GaussianModel.get_{kind}"
-        function, read = repo.function(module, name), kind in ("xyz", "opacity")
-        decorators = function.decorator_list if function else []
+    found, model = [], ModelClass(repo)
+    computed = computed_getters(model, unset)
+    for kind, getter in model.getters.items() if repo.tree(MODEL) else ():  # else the seams say so
+        decorators = " ".join(map(text_of, getter.decorator_list)) if getter else ""
         if kind in computed:
-            made = (each.value for each in every(function, ast.Return))
+            made = (each.value for each in every(getter, ast.Return))
             ends = " or ".join(text_of(each) for each in made if each)
             what = f"get_{kind} is computed, it returns {ends[:60] or 'nothing'}"
-        elif read and not any("property" in text_of(each) for each in decorators):
-            what = "a method" if function else "no such property"
+        elif kind in ("xyz", "opacity") and "property" not in decorators:
+            what = "a method" if getter else "no such property"
         else:
             continue
-        at = f"{module}:{name} ({repo.place(module, name)})"
+        at = f"{MODEL}:{model.name}.get_{kind} ({model.at(f'get_{kind}')})"
         expected = f"a property of the rows of self._{kind}, activated if they are no positions"
         found.append(Finding.error("model-getter", at, what, expected))
     return found
 
 
-def computed_getters(
-    repo: HostRepo, module: str, model: str, unset: Collection[str] = ()
-) -> list[str]:
+def computed_getters(model: ModelClass, unset: Collection[str] = ()) -> list[str]:
     """The kinds of values, and "features", whose getter gives other than its parameters.
 
     What getters do where attributes in ``unset`` are not None does not count.
     """
-    getters = {
-        each: repo.function(module, f"{model}.get_{each}") for each in (*GETTERS, "features")
-    }
-    own = getters.pop("features")
-    other = any(text_of(each.func) not in _JOINS for each in every(own, ast.Call))
-    wanted = {kind: {"stored" if kind == "xyz" else "activated"} for kind in GETTERS}
-    return [
-        *(k for k, each in getters.items() if each and returns(each, f"_{k}", unset) != wanted[k]),
-        *(["features"] if other or every(own, ast.BinOp) else []),
-    ]
+    found = []
+    for kind, getter in model.getters.items():
+        wanted = {"stored" if kind == "xyz" else "activated"}
+        if getter and returns(getter, f"_{kind}", unset) != wanted:
+            found.append(kind)
+    features = model.method("get_features")
+    other = any(text_of(each.func) not in _JOINS for each in every(features, ast.Call))
+    return [*found, "features"] if other or every(features, ast.BinOp) else found
 
 
-def unset(repo: HostRepo, module: str, model: str) -> set[str]:
+def unset(model: ModelClass) -> set[str]:
     """Attributes that getters of a model ask for, and that are None at first."""
-    getters = (repo.function(module, f"{model}.get_{kind}") for kind in GETTERS)
-    texts = " ".join(text_of(each) for each in getters if each)
-    asked = {each: list(defaults(repo, module, each)) for each in _ASKED.findall(texts)}
-    nothing = {each: {getattr(v, "value", v) for v in values} for each, values in asked.items()}
-    return {each for each, values in nothing.items() if values == {None}}
+    asked = {each for getter in model.getters.values() for each in _ASKED.findall(text_of(getter))}
+    values = {each: defaults(model.repo, model.module, each) for each in asked}
+    return {k for k, v in values.items() if v and all(getattr(n, "value", n) is None for n in v)}
 
 
 Node = TypeVar("Node", bound=ast.AST)
 
 
 @lru_cache(maxsize=1 << 16)
-def text_of(node: ast.AST) -> str:
-    """A part of a tree from ``parsed`` as code, cached: many ask."""
-    return ast.unparse(node)
+def text_of(node: ast.AST | None) -> str:
+    """A part of a tree from ``parsed`` as code, cached: many ask; "" of None."""
+    return ast.unparse(node) if node else ""
 
 
 def every(tree: ast.AST | None, *kinds: type[Node]) -> tuple[Node, ...]:
@@ -160,35 +176,38 @@ def failing(repo: HostRepo, scripts: Collection[str]) -> list[str]:
     others to Python; another framework; compiled training; calls that their functions do not take;
     a PLY that gets its name after it was saved.
     """
-    found = [
-        f"{path} imports {name}, which is no module of this folder"
-        for module in ("gaussian_renderer", "scene", MODEL, "train")
-        for node in getattr(repo.tree(module), "body", ())
-        if isinstance(node, ast.Import | ast.ImportFrom)
-        for name in repo.imported_by(module, node)[:1]
-        for path in [repo.at(module, node.lineno)]
-        for top in [name.split(".")[0]]
-        if _ELSEWHERE.fullmatch(name) and not (repo.path(top) or (repo.root / top).is_dir())
-    ][:1]
-    saving = text_of(repo.function("scene", "Scene.save") or ast.Pass())
+    found = [*_imported_elsewhere(repo)][:1]
+    saving = text_of(repo.function("scene", "Scene.save"))
     if re.search(r"\b(os\.(replace|rename)|shutil\.move)\(", saving):
         found.append("Scene.save renames the PLY that it saves, and loses its thresholds")
     found += [*_left_out(repo, scripts)][:1]
     for script in scripts:
-        tree, home = repo.tree(module_of(script)), home_of(repo, module_of(script))
-        found += [f"{script} trains the GaussianModel of {home}"] * (
-            home.startswith("scene") and home != MODEL
-        )
-        found += [f"{script} trains by jittor"] * ("jittor" in imported(tree))
-        found += [
-            f"{script} compiles {node.name}, which trains"
-            for node in learning(tree)
-            if any("torch.compile" in text_of(each) for each in node.decorator_list)
-        ]
         module = module_of(script)
+        tree, home = repo.tree(module), home_of(repo, module)
+        if home.startswith("scene") and home != MODEL:
+            found.append(f"{script} trains the GaussianModel of {home}")
+        if "jittor" in imported(tree):
+            found.append(f"{script} trains by jittor")
+        for node in learning(tree):
+            if any("torch.compile" in text_of(each) for each in node.decorator_list):
+                found.append(f"{script} compiles {node.name}, which trains")
         found += (*_misfits(repo, module), *_absent(repo, module), *_own_folders(repo, module))[:1]
         found += [f"{script} draws by {each}" for each in _drawn_elsewhere(repo, module)][:1]
     return found
+
+
+def _imported_elsewhere(repo: HostRepo) -> Iterator[str]:
+    """Modules of the training code that are imported as if they lay in another folder."""
+    for module in ("gaussian_renderer", "scene", MODEL, "train"):
+        for node in getattr(repo.tree(module), "body", ()):
+            if isinstance(node, ast.Import | ast.ImportFrom):
+                name = next(iter(repo.imported_by(module, node)))
+                top = name.split(".")[0]
+                if _ELSEWHERE.fullmatch(name) and not (
+                    repo.path(top) or (repo.root / top).is_dir()
+                ):
+                    at = repo.at(module, node.lineno)
+                    yield f"{at} imports {name}, which is no module of this folder"
 
 
 def learning(tree: ast.AST | None) -> list[ast.FunctionDef]:
@@ -224,7 +243,7 @@ def _drawn_elsewhere(repo: HostRepo, module: str) -> Iterator[str]:
         for each in node.names if beside.startswith(f"{usual}.") else ():
             home, body = _definition(repo, beside, each.name)
             own = _definition(repo, usual, each.name)[0]
-            if own and home != own and "GaussianRasterizer(" in text_of(body or ast.Pass()):
+            if own and home != own and "GaussianRasterizer(" in text_of(body):
                 yield f"{each.name} of {home}, not of {usual}"
 
 
@@ -259,7 +278,7 @@ def _misfits(repo: HostRepo, module: str) -> tuple[str, ...]:
     models = {to for to, value in pairs if value.startswith("GaussianModel(")}
     models -= {to for to, value in pairs if not value.startswith("GaussianModel(")}
     gone = tried | skipped(tree, as_options(repo, ("arguments", module))).keys()
-    texts = text_of(tree or ast.Pass()) + text_of(model or ast.Pass())
+    texts = text_of(tree) + text_of(model)
     calls = [each for each in every(tree, ast.Call) if each not in gone]
     for node in sorted(calls, key=lambda each: (each.lineno, each.col_offset)):
         owner, _, name = text_of(node.func).rpartition(".")
@@ -505,25 +524,25 @@ def returns(getter: Function, stored: str, unset: Collection[str] = ()) -> set[s
     return {state(each.value) for each in every(getter, ast.Return) if each not in gone}
 
 
-def options(repo: HostRepo, module: str, model: str, scripts: Iterable[str]) -> set[str]:
+def options(model: ModelClass, scripts: Iterable[str]) -> set[str]:
     """What getters ask for that an option of its name, off by default, alone switches on."""
-    getters = (repo.function(module, f"{model}.get_{kind}") for kind in GETTERS)
-    tests = [n.test for each in getters for n in every(each, ast.If, ast.IfExp)]  # type: ignore[attr-defined]
-    asked = {n.removeprefix("not ").removeprefix("self.") for n in map(text_of, tests)}
-    pairs = (pair for each in (module, *scripts) for pair in assigned(repo.tree(each)))
+    branches = (n for each in model.getters.values() for n in every(each, ast.If, ast.IfExp))
+    tests = {text_of(n.test) for n in branches}  # type: ignore[attr-defined]
+    asked = {each.removeprefix("not ").removeprefix("self.") for each in tests}
+    trees = map(model.repo.tree, (model.module, *scripts))
     made = {
         target.attr
-        for target, value in pairs
+        for target, value in (pair for tree in trees for pair in assigned(tree))
         if isinstance(target, ast.Attribute)
         and not is_off(value)
         and text_of(value).split(".")[-1] != target.attr
     }
-    names = {each: each.split(".")[-1] for each in asked}
-    values = {k: [*defaults(repo, "arguments", each)] for k, each in names.items()}
     return {
         each
-        for each, given in values.items()
-        if given and all(map(is_off, given)) and names[each] not in made
+        for each in asked
+        if (name := each.split(".")[-1]) not in made
+        and (given := defaults(model.repo, "arguments", name))
+        and all(map(is_off, given))
     }
 
 
