@@ -51,23 +51,18 @@ _DRAWN = re.compile(r"if\(test_T<0\.0001\)\{done=true;continue;\}")
 
 @dataclass(frozen=True)
 class Output:
-    """A value that a rasterizer returns.
+    """A value that a rasterizer returns, by the name that the source gives it.
 
-    Attributes:
-        name: that the source gives it.
-        role: what it is; "count" and "weight" are a Gaussian's drawn fragments and their sum of
-            alpha T, "unread" one that nobody reads, "unproved" one that only the numbers of the
-            host's own rasterizer can tell.
-        column: of one number per Gaussian, whether it is (P, 1), not (P,).
-        integer: likewise, whether it is int32.
-        detached: whether no gradient of it moves a Gaussian.
+    Its role "count" is the number of a Gaussian's drawn fragments, "weight" their sum of alpha T;
+    "unread" is one that nobody reads, "unproved" one that only the numbers of the host's own
+    rasterizer can tell.
     """
 
     name: str
     role: Role
-    column: bool = False
-    integer: bool = False
-    detached: bool = False
+    column: bool = False  # of one number per Gaussian: (P, 1), not (P,)
+    integer: bool = False  # likewise: int32
+    detached: bool = False  # no gradient of it moves a Gaussian
 
 
 def meaning(repo: HostRepo, call: graphdeco.CallInSource, name: str) -> Output:
@@ -210,9 +205,11 @@ def changed_gradients(repo: HostRepo, package: str, setting: str) -> frozenset[s
             made = {each.name: each for each in node.body if isinstance(each, ast.FunctionDef)}
             if {"forward", "backward"} <= made.keys():
                 forward, backward = made["forward"], made["backward"]
-                if _reads(forward, setting) or not _reads(backward, setting):
-                    return None
-                return _changed(forward, backward)
+                reads = [
+                    any(each.attr == setting for each in every(part, ast.Attribute))
+                    for part in (forward, backward)
+                ]
+                return _changed(forward, backward) if reads == [False, True] else None
     return None
 
 
@@ -222,10 +219,6 @@ def _binding(repo: HostRepo, package: str) -> Iterator[ast.AST]:
     for folder in kernels.vendored(repo, package):
         with suppress(SyntaxError):
             yield from ast.walk(ast.parse(repo.read(folder / name / "__init__.py")))
-
-
-def _reads(function: ast.FunctionDef, setting: str) -> bool:
-    return any(node.attr == setting for node in every(function, ast.Attribute))
 
 
 def _changed(forward: ast.FunctionDef, backward: ast.FunctionDef) -> frozenset[str] | None:

@@ -337,25 +337,21 @@ class GraphdecoAdapter(ScriptAdapter):
         there = [each for each in functions if repo.function(renderer, each)]  # or no seam
         found = []
         for name in dict.fromkeys([*there, *drawing_functions(repo, renderer)]):
-            expected = [str(each) for each in accepted if each.function == name]
-            calls = read_calls(repo, renderer, name)
+            known = [str(each) for each in accepted if each.function == name]
+            expected = " or ".join(known) or f"a rasterizer in {', '.join(functions)} alone"
+            calls, others = read_calls(repo, renderer, name), []
             for each in calls:
                 own = each.package == self.package
                 call = replace(each, package="") if own else each
                 if call.other_matrix or not any(known.answers(call) for known in accepted):
-                    found.append((name, repo.at(renderer, each.line), str(call), expected))
+                    others.append((repo.at(renderer, each.line), str(call)))
             if not calls:
                 nothing = "no settings passed by keyword, or they are made elsewhere"
-                found.append((name, repo.place(renderer, name), nothing, expected))
-        return [
-            Finding.error(
-                "rasterizer-call",
-                f"{renderer}:{name} ({at})",
-                what,
-                " or ".join(expected) or f"a rasterizer in {', '.join(functions)} alone",
-            )
-            for name, at, what, expected in found
-        ]
+                others.append((repo.place(renderer, name), nothing))
+            for at, what in others:
+                place = f"{renderer}:{name} ({at})"
+                found.append(Finding.error("rasterizer-call", place, what, expected))
+        return found
 
     def _accepted(self) -> tuple[str, list[RasterizerCall]]:
         """The module whose functions draw, and ``calls`` with the function that makes each.

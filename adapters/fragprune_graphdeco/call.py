@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from fragprune_graphdeco.reading import assigned, every, text_of
@@ -115,25 +115,42 @@ def read_calls(repo: HostRepo, module: str, function: str) -> list[CallInSource]
     if body is None:
         return []
     imported = _Imported(repo, module, body)
-    made = [node for node in nodes(body) if imported.of(node, SETTINGS)]
-    names = _settings(made[0]) if made else {}  # type: ignore[arg-type]
-    if not names:
+    made = [node for node in every(body, ast.Call) if imported.of(node, SETTINGS)]
+    settings = _settings(made[0]) if made else {}
+    if not settings:
         return []
-    drawn = list(_drawn(imported, body)) or [(body.lineno, imported.package(made[0]), (), (), {})]
-    return [
-        CallInSource(
-            frozenset(names) - set(SHARED),
-            len(unpacked) or None,
-            function,
-            frozenset(given) - set(ARGUMENTS),
-            package,
-            tuple(names),
-            line,
-            unpacked or taken,
-            given | names,
+
+    def call(
+        maker: ast.Call, place: ast.expr | Function, given: dict[str, ast.expr] | None = None
+    ) -> CallInSource:
+        unpacked = tuple(getattr(each, "id", "") for each in getattr(place, "elts", ()))
+        return CallInSource(
+            besides=frozenset(settings) - set(SHARED),
+            outputs=len(unpacked) or None,
+            function=function,
+            arguments=frozenset(given or ()) - set(ARGUMENTS),
+            package=imported.package(maker),
+            settings=tuple(settings),
+            line=place.lineno,
+            names=unpacked or _taken(body, getattr(place, "id", "")),
+            given=(given or {}) | settings,
         )
-        for line, package, unpacked, taken, given in sorted(drawn, key=lambda each: each[0])
-    ]
+
+    targets = {value: target for target, value in assigned(body)}
+    named = ((to, value) for value, to in targets.items() if isinstance(to, ast.Name))
+    rasterizers = {to.id: value for to, value in named if imported.of(value, RASTERIZER)}
+    found = []
+    for node in every(body, ast.Call):
+        called = node.func
+        if isinstance(called, ast.Attribute) and called.attr != "markVisible":
+            called = called.value  # another method that draws
+        own = imported.of(called, RASTERIZER)
+        if own or getattr(called, "id", None) in rasterizers:
+            maker: ast.Call = called if own else rasterizers[called.id]  # type: ignore[attr-defined, assignment]
+            keywords = [each for each in maker.keywords if each.arg != "raster_settings"]
+            given = {each.arg: each.value for each in [*keywords, *node.keywords] if each.arg}
+            found.append(call(maker, targets.get(node, node), given))
+    return sorted(found, key=lambda each: each.line) or [call(made[0], body)]
 
 
 def _settings(made: ast.Call) -> dict[str, ast.expr]:
@@ -141,34 +158,6 @@ def _settings(made: ast.Call) -> dict[str, ast.expr]:
     unnamed = [SHARED[i] if i < len(SHARED) else f"number {i + 1}" for i in range(len(made.args))]
     named = {each.arg: each.value for each in made.keywords if each.arg}
     return dict(zip(unnamed, made.args, strict=True)) | named
-
-
-def _drawn(
-    imported: _Imported, body: Function
-) -> Iterator[tuple[int, str, tuple[str, ...], tuple[str, ...], dict[str, ast.expr]]]:
-    """Line, package, names of the values, of those that are taken of them later, and arguments of
-    every call of the rasterizer.
-    """
-    targets = {value: target for target, value in assigned(body)}
-    named = ((to, value) for value, to in targets.items() if isinstance(to, ast.Name))
-    rasterizers = {to.id: value for to, value in named if imported.of(value, RASTERIZER)}
-    for node in every(body, ast.Call):
-        called = node.func
-        if isinstance(called, ast.Attribute) and called.attr != "markVisible":
-            called = called.value  # another method that draws
-        own = imported.of(called, RASTERIZER)
-        if own or getattr(called, "id", None) in rasterizers:
-            target = targets.get(node, node)
-            values = [getattr(each, "id", "") for each in getattr(target, "elts", [])]
-            made: ast.Call = called if own else rasterizers[called.id]  # type: ignore[attr-defined, assignment]
-            keywords = [each for each in made.keywords if each.arg != "raster_settings"]
-            yield (
-                target.lineno,
-                imported.package(made),
-                tuple(values),
-                _taken(body, getattr(target, "id", "")),
-                {each.arg: each.value for each in [*keywords, *node.keywords] if each.arg},
-            )
 
 
 def _taken(body: Function, whole: str) -> tuple[str, ...]:

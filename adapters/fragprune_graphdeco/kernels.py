@@ -52,17 +52,11 @@ ORDER = "order"
 
 @dataclass(frozen=True)
 class Kernel:
-    """How a rasterizer draws a Gaussian.
+    """How a rasterizer draws a Gaussian."""
 
-    Attributes:
-        exponent: the exponent of the falloff, as normalised source.
-        says: the same for people.
-        projected: the Gaussian is projected by the EWA Jacobian and widened by a low-pass filter.
-    """
-
-    exponent: re.Pattern[str]
-    says: str
-    projected: bool = True
+    exponent: re.Pattern[str]  # of the falloff, as normalised source
+    says: str  # the same for people
+    projected: bool = True  # by the EWA Jacobian, and widened by a low-pass filter
 
 
 SPLAT = Kernel(_QUADRATIC, "alpha = min(0.99, opacity exp(-q/2)), q from the conic")
@@ -70,15 +64,9 @@ SURFEL = Kernel(_SURFEL, "alpha = min(0.99, opacity exp(-rho/2))", projected=Fal
 
 
 def read_kernels(repo: HostRepo, package: str, kernel: Kernel) -> list[Finding]:
-    """Compare the sources of a rasterizer that a checkout vendors with a known rule.
+    """How the sources of a rasterizer that a checkout vendors differ from a known rule.
 
-    Args:
-        package: import name of the rasterizer.
-        kernel: the rule that the adapter's engines draw by.
-
-    Returns:
-        An error for each difference; a warning where an exponent cannot be read. Empty if the
-        checkout vendors no such package.
+    An error for each difference, a warning where an exponent cannot be read.
     """
     return [each for project in _projects(repo, package) for each in project.compare(kernel)]
 

@@ -105,17 +105,11 @@ def _told(off: Tensor, away: Tensor, slack: int) -> str:
 
 @dataclass(frozen=True)
 class Seen:
-    """What our engine draws for a host's call.
+    """What our engine draws for a host's call."""
 
-    Attributes:
-        drawn: its outputs for ``widened`` inputs.
-        inputs: as the dialect made them.
-        draw: draws others, without thresholds for rows behind these.
-    """
-
-    drawn: RasterOutputs
-    inputs: RasterInputs
-    draw: Callable[[RasterInputs], RasterOutputs]
+    drawn: RasterOutputs  # its outputs for ``widened`` inputs
+    inputs: RasterInputs  # as the dialect made them
+    draw: Callable[[RasterInputs], RasterOutputs]  # without thresholds for rows behind these
 
     @property
     def splats(self) -> Splats | None:

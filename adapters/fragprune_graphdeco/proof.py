@@ -144,23 +144,14 @@ class _OtherwiseError(Exception):
 
 @dataclass(frozen=True)
 class _Both:
-    """One call, drawn by both.
+    """One call, drawn by both."""
 
-    Attributes:
-        what: which arguments, for people.
-        leaves: the arguments that get gradients, one row per Gaussian.
-        theirs: what the host's rasterizer returned.
-        ours: what the dialect answers.
-        seen: what our engine draws, with all meanings.
-        slack: how many times more they may differ than by rounding alone.
-    """
-
-    what: str
-    leaves: dict[str, Tensor]
-    theirs: tuple[Any, ...]
-    ours: tuple[Any, ...]
-    seen: Seen
-    slack: int
+    what: str  # which arguments, for people
+    leaves: dict[str, Tensor]  # the arguments that get gradients, one row per Gaussian
+    theirs: tuple[Any, ...]  # what the host's rasterizer returned
+    ours: tuple[Any, ...]  # what the dialect answers
+    seen: Seen  # what our engine draws, with all meanings
+    slack: int  # how many times more they may differ than by rounding alone
 
 
 class _Trial:

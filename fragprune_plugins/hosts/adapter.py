@@ -201,7 +201,6 @@ class CommandLine:
         Raises:
             UsageError: a flag lacks its value, or the configuration file cannot be read.
         """
-        parser = Flags(add_help=False, allow_abbrev=False, conflict_handler="resolve")
         options: dict[str, dict[str, Any]] = {
             "resolution": {"type": int},
             "images": {},
@@ -213,24 +212,8 @@ class CommandLine:
             "save_checkpoints": {"type": int, "nargs": "*"},
             "resume": {},
         }
-        for name, options_of in options.items():
-            if flags := self.spellings(name):
-                parser.add_argument(*flags, dest=name, **options_of)
-        values, written = self._parsed(parser, arguments, dict.fromkeys(options))
-        for name in options:
-            key = ("", *self.spellings(name))[-1].lstrip("-")
-            setattr(values, name, written.get(key, getattr(values, name)))
-        return values
-
-    def _parsed(
-        self, parser: Flags, arguments: list[str], values: dict[str, Any]
-    ) -> tuple[argparse.Namespace, dict[str, Any]]:
-        """Values of flags that a parser knows, and those of the configuration file."""
-        if self.config:
-            parser.add_argument(self.config.flag, dest="config", type=Path)
-        given, _ = parser.parse_known_args(arguments, argparse.Namespace(**values))
-        file = self.config and given.config
-        return given, read_config(self.config, file) if self.config and file else {}
+        flags = {name: (self.spellings(name), more) for name, more in options.items()}
+        return argparse.Namespace(**self._parsed(arguments, flags))
 
     def numbers(self, arguments: list[str], **defaults: Sequence[int]) -> dict[str, list[int]]:
         """Numbers of other flags, by name, as the host will read them.
@@ -241,12 +224,33 @@ class CommandLine:
         Raises:
             UsageError: a value is no number, or the configuration file cannot be read.
         """
-        parser = Flags(add_help=False, allow_abbrev=False)
-        for name, default in defaults.items():
-            parser.add_argument(f"--{name}", type=int, nargs="+", default=[*default])
-        values, written = self._parsed(parser, arguments, {})
-        found = {name: written.get(name, getattr(values, name)) for name in defaults}
-        return {name: each if isinstance(each, list) else [each] for name, each in found.items()}
+        flags = {
+            name: ((f"--{name}",), {"type": int, "nargs": "+", "default": [*default]})
+            for name, default in defaults.items()
+        }
+        found = self._parsed(arguments, flags)
+        lists = ((name, found[name]) for name in defaults)
+        return {name: each if isinstance(each, list) else [each] for name, each in lists}
+
+    def _parsed(
+        self, arguments: list[str], flags: Mapping[str, tuple[Sequence[str], dict[str, Any]]]
+    ) -> dict[str, Any]:
+        """Values of flags by name, and "config"; what that file says goes before the command.
+
+        Args:
+            flags: by name, their spellings and what argparse is told of them.
+        """
+        parser = Flags(add_help=False, allow_abbrev=False, conflict_handler="resolve")
+        for name, (spellings, more) in flags.items():
+            if spellings:
+                parser.add_argument(*spellings, dest=name, **more)
+        if self.config:
+            parser.add_argument(self.config.flag, dest="config", type=Path)
+        given = vars(parser.parse_known_args(arguments)[0])
+        file = self.config and given["config"]
+        written = read_config(self.config, file) if self.config and file else {}
+        keys = {name: ("", *spellings)[-1].lstrip("-") for name, (spellings, _) in flags.items()}
+        return given | {name: written.get(key, given.get(name)) for name, key in keys.items()}
 
 
 class HostAdapter(ABC):
