@@ -15,7 +15,7 @@ import shutil
 import sys
 from argparse import ArgumentParser
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
@@ -45,7 +45,7 @@ FAINT = -9.0
 """The opacity's logit in rows that an action makes too faint to keep, before it calls the host."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Chance:
     """The randomness of one action; an equal ``Chance`` repeats the action.
 
@@ -56,11 +56,9 @@ class Chance:
 
     seed: int
     share: float
-    generator: torch.Generator = field(init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        generator = torch.Generator().manual_seed(self.seed)
-        object.__setattr__(self, "generator", generator)
+        self.generator = torch.Generator().manual_seed(self.seed)
 
     def uniform(self, *shape: int) -> Tensor:
         """Random numbers in [0, 1), of this shape."""
@@ -434,8 +432,7 @@ def alone(*, driver: Host, **options: Any) -> Iterator[Running]:
 def joint(settings: Settings | None = None, **options: Any) -> Any:
     """The host under a session that learns from the first step and freezes nothing."""
     settings = settings or Settings(iterations=20, stop=None)
-    schedule = JointSchedule(settings, 1)
-    return running(settings, freeze=False, schedule=schedule, **options)
+    return running(settings, freeze=False, schedule=JointSchedule(settings, 1), **options)
 
 
 def tensors(driver: Host, model: Any) -> dict[str, Tensor]:

@@ -6,15 +6,10 @@ broken.
 
 from __future__ import annotations
 
-from fragprune_plugins.testing.invariants.alignment import alignment
 from fragprune_plugins.testing.invariants.case import Case
-from fragprune_plugins.testing.invariants.freeze import freeze
-from fragprune_plugins.testing.invariants.monotone import monotone
-from fragprune_plugins.testing.invariants.neutral import neutral_is_the_host
-from fragprune_plugins.testing.invariants.off import nothing_stays, off_is_off, orders
-from fragprune_plugins.testing.invariants.picture import same_picture
-from fragprune_plugins.testing.invariants.refuse import refuse
-from fragprune_plugins.testing.invariants.round_trip import checkpoint, model_file
+from fragprune_plugins.testing.invariants.drawing import monotone, neutral_is_the_host, same_picture
+from fragprune_plugins.testing.invariants.learning import alignment, checkpoint, freeze, model_file
+from fragprune_plugins.testing.invariants.patching import nothing_stays, off_is_off, orders, refuse
 
 __all__ = [
     "Case",
