@@ -38,12 +38,9 @@ class SurfelDialect(GraphdecoDialect):
             InputError: the host passed matrices instead of scales and rotations.
         """
         if call.get("cov3D_precomp") is not None:
-            raise InputError(
-                "diff_surfel_rasterization",
-                "cov3D_precomp, the surfels' matrices, of which the host draws no normals",
-                "scales and rotations",
-                "Leave out --compute_cov3D_python.",
-            )
+            found = "cov3D_precomp, the surfels' matrices, of which the host draws no normals"
+            remedy = "Leave out --compute_cov3D_python."
+            raise InputError("diff_surfel_rasterization", found, "scales and rotations", remedy)
         return replace(super().unpack(call), planes=("alpha", "surface"))
 
     def pack(self, outputs: RasterOutputs, call: HostCall) -> tuple[Tensor, ...]:

@@ -109,12 +109,10 @@ class Compact3DGS(GraphdecoAdapter):
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
         """Refuse: no command can resume this host's training."""
-        raise UsageError(
-            "stage 2 of Compact-3DGS",
-            "checkpoints without its mask and its colour network: the host cannot resume them",
-            "--stage finetune --from-iter N and --iterations N + 5000 of one run",
-            "Add --from-iter with the iteration that training should end at.",
-        )
+        found = "checkpoints without its mask and its colour network: the host cannot resume them"
+        expected = "--stage finetune --from-iter N and --iterations N + 5000 of one run"
+        remedy = "Add --from-iter with the iteration that training should end at."
+        raise UsageError("stage 2 of Compact-3DGS", found, expected, remedy)
 
     def group_name(self, model: Any, group: Mapping[str, Any]) -> str | None:
         """The group's name; the network's group has none in the host, so it gets ours."""

@@ -81,12 +81,9 @@ class _Unanswered(ModuleType):
             raise AttributeError(name)
 
         def refuse(*args: Any, **kwargs: Any) -> None:
-            raise EngineError(
-                f"{self.__name__}.{name}",
-                "called without its compiled module",
-                "a --mode without pruning or culling",
-                "Choose base or noreg, or run where the package's CUDA modules do.",
-            )
+            where, found = f"{self.__name__}.{name}", "called without its compiled module"
+            remedy = "Choose base or noreg, or run where the package's CUDA modules do."
+            raise EngineError(where, found, "a --mode without pruning or culling", remedy)
 
         return refuse
 
@@ -261,12 +258,10 @@ def _follow(instruct: Any, numbers: Tensor) -> tuple[Tensor, Tensor]:
         origins, fresh = origins[~instruct.remove_mask], fresh[~instruct.remove_mask]
     if instruct.new_features_dc is not None:
         if instruct.new_features_dc.shape[1] != 2:
-            raise AlignmentError(
-                "DensificationInstruct.new_features_dc",
-                "rows that are not copies of the model's",
-                "colours taken from the model by row",
-                "Use one of the package's own densifiers.",
-            )
+            where = "DensificationInstruct.new_features_dc"
+            found = "rows that are not copies of the model's"
+            expected = "colours taken from the model by row"
+            raise AlignmentError(where, found, expected, "Use one of the package's own densifiers.")
         added = carried(instruct.new_features_dc)
         origins = torch.cat([origins, added])
         fresh = torch.cat([fresh, torch.ones_like(added, dtype=torch.bool)])

@@ -217,12 +217,9 @@ class Gsplat(HostAdapter):
             return splats_in(given["obj"]) if to_file else None
         params = given.get("params", given.get("means"))
         if isinstance(params, dict):
-            raise SessionError(
-                "params",
-                "a plain dict, which cannot hold a session's state",
-                "torch.nn.ParameterDict",
-                "Convert it: params = torch.nn.ParameterDict(params).",
-            )
+            found = "a plain dict, which cannot hold a session's state"
+            remedy = "Convert it: params = torch.nn.ParameterDict(params)."
+            raise SessionError("params", found, "torch.nn.ParameterDict", remedy)
         if given.get("format", "ply") != "ply":
             return None  # other formats sort their rows
         return params if isinstance(params, torch.nn.ParameterDict | torch.Tensor) else None

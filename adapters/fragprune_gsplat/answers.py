@@ -42,12 +42,9 @@ def covariance(call: SeamCall) -> tuple[Tensor, None]:
         done: tuple[Tensor, None] = call.run()
         return done
     if given["compute_preci"] or given["triu"] or not given["compute_covar"]:
-        raise InputError(
-            "gsplat.quat_scale_to_covar_preci",
-            "precisions or triangles asked for",
-            "covariances (N, 3, 3), as MCMCStrategy does",
-            "Compute these on a machine with a GPU.",
-        )
+        where, found = "gsplat.quat_scale_to_covar_preci", "precisions or triangles asked for"
+        expected = "covariances (N, 3, 3), as MCMCStrategy does"
+        raise InputError(where, found, expected, "Compute these on a machine with a GPU.")
     return covariances(given["quats"], given["scales"]), None
 
 
@@ -60,10 +57,6 @@ def alone(call: SeamCall) -> Any:
     """
     given, count = call.arguments, torch.cuda.device_count()
     if count > 1:
-        raise EngineError(
-            "gsplat.distributed.cli",
-            f"{count} GPUs, and a process for each",
-            "one GPU",
-            "Choose it: set CUDA_VISIBLE_DEVICES=0.",
-        )
+        where, found = "gsplat.distributed.cli", f"{count} GPUs, and a process for each"
+        raise EngineError(where, found, "one GPU", "Choose it: set CUDA_VISIBLE_DEVICES=0.")
     return call.run() if count else given["fn"](0, 0, 1, given["args"])

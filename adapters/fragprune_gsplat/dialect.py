@@ -171,12 +171,9 @@ class GsplatDialect(Dialect):
         for name, known in ONLY.items():
             value = given.get(name, known[0])
             if not any(value is each or value == each for each in known):
-                raise InputError(
-                    f"gsplat.rasterization({name}=)",
-                    repr(value)[:60],
-                    " or ".join(map(repr, known)),
-                    "Draw this without thresholds: with fragprune_plugins.paused(): ...",
-                )
+                where = f"gsplat.rasterization({name}=)"
+                remedy = "Draw this without thresholds: with fragprune_plugins.paused(): ..."
+                raise InputError(where, repr(value)[:60], " or ".join(map(repr, known)), remedy)
         degree, colors = given["sh_degree"], given["colors"]
         trains = torch.is_grad_enabled() and given["means"].requires_grad and not call.still
         checks = (

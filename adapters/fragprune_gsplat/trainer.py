@@ -132,12 +132,9 @@ class SimpleTrainer(Gsplat, ScriptAdapter):
         for name, values in given(arguments).items():
             known = None if name in theirs else ONLY.get(name)
             if known and (values or ["True"])[0] not in known:
-                raise UsageError(
-                    f"simple_trainer --{name}",
-                    " ".join(values) or "given",
-                    " or ".join(known),
-                    "Remove the flag, or train without fragprune.",
-                )
+                where = f"simple_trainer --{name}"
+                remedy = "Remove the flag, or train without fragprune."
+                raise UsageError(where, " ".join(values) or "given", " or ".join(known), remedy)
 
     def lengthened(self, arguments: list[str], first: int, last: int) -> list[str]:
         """Arguments with which the script trains on until ``last``, and saves at ``first`` too."""

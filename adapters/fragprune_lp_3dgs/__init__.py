@@ -118,12 +118,10 @@ class LP3DGS(GraphdecoAdapter):
             UsageError: ``--prune_method compact_3dgs``.
         """
         if "compact_3dgs" in arguments or "--prune_method=compact_3dgs" in arguments:
-            raise UsageError(
-                "--prune_method compact_3dgs",
-                "a model with a mask among its parameters, and a resume that fails in the host",
-                "3dgs, mini_splatting or rad_splat",
-                "Fine-tune its PLY with fragprune finetune.",
-            )
+            where = "--prune_method compact_3dgs"
+            found = "a model with a mask among its parameters, and a resume that fails in the host"
+            expected = "3dgs, mini_splatting or rad_splat"
+            raise UsageError(where, found, expected, "Fine-tune its PLY with fragprune finetune.")
         return script, arguments
 
     def densified(self, repo: HostRepo, script: Path, arguments: list[str]) -> int | None:

@@ -67,12 +67,10 @@ def following_copies(call: SeamCall) -> Iterator[RowTrace]:
     if len(rows) != len(parents) or not all(
         torch.equal(each[rows], each[parents]) for each in (colours, turns)
     ):
-        raise AlignmentError(
-            str(call.seam),
-            f"{len(rows)} new rows that are not copies of the {len(parents)} sampled",
-            "one copy per sampled row, in the host's order",
-            "Report this with the host's commit: its relocation differs.",
-        )
+        where = str(call.seam)
+        found = f"{len(rows)} new rows that are not copies of the {len(parents)} sampled"
+        remedy = "Report this with the host's commit: its relocation differs."
+        raise AlignmentError(where, found, "one copy per sampled row, in the host's order", remedy)
     origins[rows] = parents
     trace.origins, trace.fresh = origins, torch.zeros_like(origins, dtype=torch.bool)
     trace.fresh[rows] = trace.fresh[parents] = True

@@ -48,12 +48,9 @@ def render_depth(
     splats = inputs.splats
     assert isinstance(splats, Splats)  # what unpack makes of the host's call
     if splats.scales is None or splats.rotations is None:
-        raise InputError(
-            "render_depth",
-            "precomputed covariances",
-            "scales and rotations, which the host's own rasterizer reads here",
-            "Leave out --compute_cov3D_python.",
-        )
+        found = "precomputed covariances"
+        expected = "scales and rotations, which the host's own rasterizer reads here"
+        raise InputError("render_depth", found, expected, "Leave out --compute_cov3D_python.")
     inputs = replace(inputs, planes=("alpha",))
     drawn = draw(inputs)
     winners, left, image = drawn.winners, 1 - drawn.alpha[0], drawn.image

@@ -33,12 +33,10 @@ def rows_exported(params: Mapping[str, Tensor], columns: Mapping[str, Any]) -> T
         AlignmentError: the file's rows are not the model's in their order.
     """
     if absent := [each for names in COLUMNS.values() for each in names if each not in columns]:
-        raise AlignmentError(
-            "ns-export gaussian-splat",
-            f"a file without {', '.join(absent)}",
-            "the model's positions, opacities, scales and rotations",
-            "Report this with nerfstudio's version: it exports in another way.",
-        )
+        where = "ns-export gaussian-splat"
+        expected = "the model's positions, opacities, scales and rotations"
+        remedy = "Report this with nerfstudio's version: it exports in another way."
+        raise AlignmentError(where, f"a file without {', '.join(absent)}", expected, remedy)
     files = {
         name: torch.from_numpy(
             np.stack([np.asarray(columns[each]).reshape(-1) for each in names], axis=1)
@@ -65,12 +63,10 @@ def rows_among(known: Mapping[str, Tensor], chosen: Mapping[str, Tensor], where:
     ours, theirs = which[: len(ours)], which[len(ours) :]
     rows = np.flatnonzero(np.isin(ours, theirs))
     if not np.array_equal(ours[rows], theirs):
-        raise AlignmentError(
-            where,
-            f"{len(theirs)} Gaussians, of which {len(rows)} are the model's in its order",
-            f"a selection of the model's {len(ours)} Gaussians",
-            "Report this with nerfstudio's version: it selects in another way.",
-        )
+        found = f"{len(theirs)} Gaussians, of which {len(rows)} are the model's in its order"
+        expected = f"a selection of the model's {len(ours)} Gaussians"
+        remedy = "Report this with nerfstudio's version: it selects in another way."
+        raise AlignmentError(where, found, expected, remedy)
     return torch.from_numpy(rows)
 
 

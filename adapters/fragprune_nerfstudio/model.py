@@ -312,12 +312,9 @@ def expect_no_script() -> None:
 
     own = getattr(__main__, "ExportGaussianSplat", None)
     if own is not None and own.__module__ == "__main__":
-        raise AlignmentError(
-            "nerfstudio.scripts.exporter",
-            "run as a script, where thresholds cannot follow its filter",
-            "the command ns-export",
-            "Run: ns-export gaussian-splat ...",
-        )
+        found = "run as a script, where thresholds cannot follow its filter"
+        remedy = "Run: ns-export gaussian-splat ..."
+        raise AlignmentError("nerfstudio.scripts.exporter", found, "the command ns-export", remedy)
 
 
 @contextmanager

@@ -70,12 +70,8 @@ def _of_model(
     """A model from its first camera, in each image size."""
     cameras = cameras or cameras_of(model)
     if cameras is None:
-        raise UsageError(
-            "--cameras",
-            "no file, and no cameras.json of a training around MODEL",
-            "a camera to draw from",
-            "Pass --cameras FILE.",
-        )
+        found = "no file, and no cameras.json of a training around MODEL"
+        raise UsageError("--cameras", found, "a camera to draw from", "Pass --cameras FILE.")
     loaded = load(model, device=device)
     splats, first = loaded.splats(), load_cameras(cameras)[0][1].to(device)
     cases: list[timing.Case] = []

@@ -59,10 +59,7 @@ def _module(point: EntryPoint) -> Path:
     """The module of an installed bridge."""
     path = Path(getattr(load(point, ModuleType), "MODULE", "MODULE"))
     if not path.is_file():
-        raise PluginError(
-            f"{point.group} {point.name}",
-            f"no file {path}",
-            "a package with the path of its JavaScript module as MODULE",
-            f"Install {point.value} again, or remove it.",
-        )
+        expected = "a package with the path of its JavaScript module as MODULE"
+        remedy = f"Install {point.value} again, or remove it."
+        raise PluginError(f"{point.group} {point.name}", f"no file {path}", expected, remedy)
     return path

@@ -191,12 +191,9 @@ def _machine_stated(where: str) -> Iterator[None]:
         known = "allocate memory" in words or "out of memory" in words  # torch's, of CPU and GPU
         if not (known or isinstance(error, MemoryError)):
             raise
-        raise MemoryLimitError(
-            where,
-            f"no memory left ({words or 'MemoryError'})",
-            "a model and pictures that fit",
-            "Close other programs, or lower the pictures' size with --resolution.",
-        ) from error
+        found = f"no memory left ({words or 'MemoryError'})"
+        remedy = "Close other programs, or lower the pictures' size with --resolution."
+        raise MemoryLimitError(where, found, "a model and pictures that fit", remedy) from error
 
 
 def usage_error(error: click.UsageError, words: list[str]) -> Exception:

@@ -186,12 +186,8 @@ def _values(stats: StepStats) -> dict[str, float]:
 
 
 def _missing(library: str) -> UsageError:
-    return UsageError(
-        "--log",
-        f"{library} is not installed",
-        f"the package {library}",
-        f"pip install 'fragprune-plugins[{library}]'",
-    )
+    remedy = f"pip install 'fragprune-plugins[{library}]'"
+    return UsageError("--log", f"{library} is not installed", f"the package {library}", remedy)
 
 
 def _places(

@@ -65,12 +65,8 @@ def photographs_for(
         return drawn_as_trained(scene, model)
     trained = trained_on(model)
     if trained is None:
-        raise UsageError(
-            "--data",
-            f"no folder, and no {ARGUMENTS} of a training around {model}",
-            "photographs",
-            remedy,
-        )
+        found = f"no folder, and no {ARGUMENTS} of a training around {model}"
+        raise UsageError("--data", found, "photographs", remedy)
     click.echo(
         printable(f"Photographs: {trained.folder}, which the model was trained on"), err=True
     )

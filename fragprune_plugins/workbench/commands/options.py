@@ -69,12 +69,9 @@ class ModelFile(click.Path):
             os.lstat(path)
         except OSError as error:
             missing = isinstance(error, FileNotFoundError)
-            raise ModelFileError(
-                str(path),
-                "no such file" if missing else f"cannot be opened ({error.strerror})",
-                "a trained splat, or the output folder of a training",
-                "Check the path.",
-            ) from error
+            found = "no such file" if missing else f"cannot be opened ({error.strerror})"
+            expected = "a trained splat, or the output folder of a training"
+            raise ModelFileError(str(path), found, expected, "Check the path.") from error
         if not os.path.isdir(path):
             return path
         try:
@@ -290,9 +287,6 @@ shard_option = click.option(
 def require_several() -> None:
     """Raise UsageError unless this is one of several processes: --shard-gaussians divides."""
     if not launched().several:
-        raise UsageError(
-            "--shard-gaussians",
-            "one process",
-            "several, among which Gaussians can be divided",
-            "Start with torchrun --nproc_per_node N -m fragprune_plugins, or leave it out.",
-        )
+        expected = "several, among which Gaussians can be divided"
+        remedy = "Start with torchrun --nproc_per_node N -m fragprune_plugins, or leave it out."
+        raise UsageError("--shard-gaussians", "one process", expected, remedy)

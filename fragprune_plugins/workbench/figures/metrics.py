@@ -39,12 +39,8 @@ def ssim(image: Tensor, target: Tensor) -> float:
     from skimage.metrics import structural_similarity
 
     if min(image.shape[-2:]) < WINDOW:
-        raise InputError(
-            "ssim",
-            f"an image of {image.shape[-1]}x{image.shape[-2]} pixels",
-            f"at least {WINDOW}x{WINDOW}",
-            "Measure on larger images.",
-        )
+        found = f"an image of {image.shape[-1]}x{image.shape[-2]} pixels"
+        raise InputError("ssim", found, f"at least {WINDOW}x{WINDOW}", "Measure on larger images.")
     first, second = (
         x.detach().clamp(0, 1).permute(1, 2, 0).cpu().double().numpy() for x in (image, target)
     )

@@ -143,10 +143,7 @@ def rasterize(
 def _of_model(model: Any, view: Any) -> tuple[RasterInputs, ThresholdStore | None]:
     """What a model is drawn with from a view."""
     if not (isinstance(model, Model) and isinstance(view, View)):
-        raise InputError(
-            "rasterize",
-            f"{type(model).__name__} and {type(view).__name__}",
-            "RasterInputs and thresholds, or a Model and a View",
-            "Pass rasterize(model, view); overview(model) makes a view.",
-        )
+        where, found = "rasterize", f"{type(model).__name__} and {type(view).__name__}"
+        remedy = "Pass rasterize(model, view); overview(model) makes a view."
+        raise InputError(where, found, "RasterInputs and thresholds, or a Model and a View", remedy)
     return RasterInputs(view, model.splats()), model.thresholds

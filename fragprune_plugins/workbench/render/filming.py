@@ -69,12 +69,10 @@ def require_encoder() -> ModuleType:
     try:
         return importlib.import_module("imageio_ffmpeg")
     except ImportError as error:
-        raise UsageError(
-            "--out",
-            "a film, and imageio-ffmpeg is not installed",
-            "the package imageio-ffmpeg, which writes films",
-            "pip install 'fragprune-plugins[video]', or name a folder for pictures.",
-        ) from error
+        found = "a film, and imageio-ffmpeg is not installed"
+        expected = "the package imageio-ffmpeg, which writes films"
+        remedy = "pip install 'fragprune-plugins[video]', or name a folder for pictures."
+        raise UsageError("--out", found, expected, remedy) from error
 
 
 def write_mp4(path: Path, frames: Iterable[Tensor], fps: int) -> None:
