@@ -65,9 +65,7 @@ def same(one, other):
 
 
 @pytest.mark.parametrize("options", [OPTIONS, EVERYTHING], ids=["opacity", "all"])
-def test_stage_2_goes_on_from_the_fine_phase_and_repeats_no_coarse_one(
-    mini, photographs, tmp_path, options
-):
+def test_stage_2_goes_on_from_the_fine_phase_alone(mini, photographs, tmp_path, options):
     words = command(mini, photographs, tmp_path / "out")
     summary = run(words, options)
     before, after = summary.model_before, summary.model_after
@@ -128,9 +126,7 @@ def test_checkpoints_of_the_first_phase_are_refused(mini, photographs, output, s
     assert "--stage off" in caught.value.remedy
 
 
-def test_a_folder_whose_name_the_host_takes_for_a_phase_is_refused_before_training(
-    mini, photographs, tmp_path
-):
+def test_a_folder_that_is_named_as_a_phase_is_refused_before_training(mini, photographs, tmp_path):
     out = tmp_path / "coarse-to-fine"
     with pytest.raises(UsageError, match="coarse-to-fine"):
         run(command(mini, photographs, out), OPTIONS)
@@ -232,9 +228,7 @@ def test_a_copy_in_another_folder_says_the_same_and_the_new_values(mmcv, config,
     assert file.read(again) == known | values | {"iterations": 9}
 
 
-def test_the_file_wins_and_stage_2_still_ends_where_it_should(
-    mmcv, mini, photographs, config, tmp_path
-):
+def test_the_file_wins_and_stage_2_ends_where_it_should(mmcv, mini, photographs, config, tmp_path):
     text = config.read_text()
     words = command(mini, photographs, tmp_path / "out", "--configs", config, iterations=1000)
     summary = run(words, OPTIONS)
@@ -255,9 +249,7 @@ def test_a_file_that_cannot_be_read_is_refused(mmcv, mini, photographs, tmp_path
         run(command(mini, photographs, tmp_path / "out", "--configs", file), OPTIONS)
 
 
-def test_the_file_is_read_without_mmcv_which_the_host_needs(
-    mini, photographs, config, tmp_path, monkeypatch
-):
+def test_the_file_is_read_without_the_hosts_mmcv(mini, photographs, config, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "mmcv", None)
     assert PythonFile("--configs").read(config)["iterations"] == LAST
     with pytest.raises(HostFailed, match="mmcv"):

@@ -161,9 +161,7 @@ def test_a_checkpoint_made_of_a_point_cloud_has_the_hosts_weight_decay(trained, 
     assert {group["weight_decay"] for group in state["param_groups"]} == {0.01}
 
 
-def test_finetune_alone_resumes_the_checkpoint_that_pruning_was_given(
-    mini, photographs, trained, tmp_path
-):
+def test_finetune_alone_resumes_the_checkpoint_of_pruning(mini, photographs, trained, tmp_path):
     """Asked for stage 2 only, the host's pruning is what has to wait."""
     summary, out = trained
     words = command(mini, "prune_finetune.py", photographs, tmp_path, 40, "--sh_degree", 2)

@@ -84,9 +84,7 @@ def trained(stage_one, tmp_path):
         for alone in ((False, True) if host in FROM_PLY else (False,))
     ],
 )
-def test_stage_two_begins_with_the_gaussians_that_are_kept(
-    alone, host, script, more, photographs, tmp_path
-):
+def test_stage_two_begins_with_what_is_kept(alone, host, script, more, photographs, tmp_path):
     folder, look = runs.written(HOSTS[host], tmp_path / "host"), Looked()
     words = runs.command(folder / script, photographs, tmp_path / "out", 10, *ENDED, *more)
     if alone:
@@ -119,9 +117,7 @@ def test_a_stage_two_that_a_look_changed_is_finished_when_asked_again(trained):
     assert not run(trained, other).already_finished
 
 
-def test_a_checkpoint_with_other_gaussians_than_the_ply_is_resumed_whole(
-    photographs, tmp_path, caplog
-):
+def test_a_checkpoint_of_other_gaussians_than_the_ply_resumes_whole(photographs, tmp_path, caplog):
     """The host densifies in the iteration in which it writes both."""
     script, look = runs.written(HOSTS["vanilla-3dgs"], tmp_path / "host") / "train.py", Looked()
     words = runs.command(script, photographs, tmp_path / "out", 10)

@@ -91,9 +91,7 @@ def test_the_metric_without_its_weights_is_said_once(mini, photographs, tmp_path
 
 
 @pytest.mark.usefixtures("ctrl_c")
-def test_an_interrupted_run_saves_at_its_iteration_whatever_the_hosts_clock_says(
-    mini, photographs, tmp_path, plug
-):
+def test_an_interrupted_run_saves_at_its_own_iteration(mini, photographs, tmp_path, plug):
     plug(InterruptAt(3))
     with pytest.raises(Interrupted):
         run(command(mini, photographs, tmp_path, 16), OPTIONS)

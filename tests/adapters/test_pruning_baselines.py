@@ -121,9 +121,7 @@ def test_compact_learns_in_the_later_part_of_its_run(compact, photographs, tmp_p
     assert summary.fragments_after < summary.fragments_before
 
 
-def test_compacts_thresholds_follow_their_gaussians_through_the_last_sort(
-    compact, photographs, tmp_path
-):
+def test_compacts_thresholds_follow_gaussians_through_the_last_sort(compact, photographs, tmp_path):
     """The same training, stored in two orders: --comp sorts by place before it saves."""
     options = replace(OPTIONS, stage="joint", from_iter=3)
     stored = []

@@ -78,9 +78,7 @@ def scene(photographs, tmp_path):
 
 
 @pytest.mark.parametrize("mode", ["ours", "ours_new", "paper_random"])
-def test_every_mode_is_fine_tuned_and_moves_opacities_and_thresholds_alone(
-    mini, scene, tmp_path, mode
-):
+def test_every_mode_is_tuned_and_moves_opacities_and_thresholds_alone(mini, scene, tmp_path, mode):
     words = command(mini, scene, tmp_path / "out", 22, f"--{mode}", "--num_gaussians", 60)
     summary = run([*words, "--c2f"], OPTIONS)
     check_stage_two(summary, "rain-gs")

@@ -59,9 +59,7 @@ def trained(stage_one, tmp_path):
 
 
 @pytest.mark.usefixtures("ctrl_c")
-def test_ctrl_c_in_stage_two_keeps_what_was_learned_and_the_run_can_be_resumed(
-    photographs, trained, plug
-):
+def test_ctrl_c_in_stage_two_keeps_what_was_learned_to_be_resumed(photographs, trained, plug):
     finetune = replace(OPTIONS, stage="finetune")
     plugin = InterruptAt(4)
     plug(plugin)
@@ -102,9 +100,7 @@ def test_sigterm_in_stage_two_saves_what_was_learned_and_exits_with_143(photogra
     assert signal.getsignal(signal.SIGTERM) is before
 
 
-def test_killed_while_saving_it_starts_again_from_stage_one_and_leaves_nothing(
-    photographs, trained, tmp_path, monkeypatch
-):
+def test_killed_while_saving_it_starts_from_stage_one(photographs, trained, tmp_path, monkeypatch):
     """The host has written its model, the sidecar is not there yet."""
     finetune = replace(OPTIONS, stage="finetune")
     killed = Path(shutil.copytree(trained, tmp_path / "killed"))
@@ -163,9 +159,7 @@ def test_a_portable_run_moves_shapes_and_leaves_thresholds_neutral(photographs, 
 
 
 @pytest.mark.parametrize("goal", [Pressure(), Control()], ids=["pruned", "control"])
-def test_a_model_is_saved_though_the_host_saves_none_of_its_last_iteration(
-    photographs, tmp_path, goal
-):
+def test_a_model_is_saved_though_the_host_saves_none_at_the_end(photographs, tmp_path, goal):
     script = runs.written(HOSTS["vanilla-3dgs"], tmp_path / "host") / "train.py"
     asked = "if iteration in saving_iterations"
     text = script.read_text()
@@ -189,9 +183,7 @@ def test_ctrl_c_keeps_a_portable_model_though_it_has_no_thresholds(photographs, 
 
 
 @pytest.mark.parametrize("end", ["return", "sys.exit(0)"])
-def test_a_host_that_learns_and_draws_nothing_is_an_error_however_it_ends(
-    photographs, tmp_path, end
-):
+def test_a_host_that_learns_and_draws_nothing_is_always_an_error(photographs, tmp_path, end):
     host = Path(shutil.copytree(HOST, tmp_path / "host"))
     script = host / "train.py"
     tick = "gaussians.update_learning_rate(iteration)"
@@ -202,9 +194,7 @@ def test_a_host_that_learns_and_draws_nothing_is_an_error_however_it_ends(
 
 
 @pytest.mark.parametrize("from_iter", [None, 18])
-def test_only_a_resumed_run_restores_what_the_folder_holds(
-    photographs, tmp_path, monkeypatch, from_iter
-):
+def test_only_a_resumed_run_restores_the_folders(photographs, tmp_path, monkeypatch, from_iter):
     """What an earlier training left there must not overwrite what this one has trained."""
     told = []
     monkeypatch.setattr(
@@ -230,7 +220,7 @@ def checkpoint(photographs, tmp_path_factory):
     ("stage", "from_iter", "learned"),
     [("joint", None, 1), ("joint", 3, 7), ("joint", 15, 4), ("finetune", 15, 4)],
 )
-def test_a_resumed_run_learns_from_an_iteration_of_the_host(
+def test_a_resumed_run_learns_from_one(
     photographs, tmp_path, checkpoint, stage, from_iter, learned
 ):
     """Of 13 to 20, in the last of which the host takes no step; densification ends at 18."""

@@ -90,9 +90,7 @@ def test_checkpoints_of_stage_two_are_no_starting_points(out, started):
     assert f"iteration 10, {out / 'chkpnt10.pth'}:" in started(out, 10)
 
 
-def test_training_again_for_less_in_the_same_folder_is_what_counts(
-    photographs, out, started, caplog
-):
+def test_training_again_for_less_in_one_folder_is_what_counts(photographs, out, started, caplog):
     run(command(photographs, out, 7), replace(OPTIONS, stage="off"))
     assert f"iteration 7, {out / ply(7)}:" in started(out, 7)
     (warning,) = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
@@ -173,9 +171,7 @@ def trained(photographs, tmp_path_factory):
 
 
 @pytest.mark.parametrize("stage", ["off", "joint", "finetune"])
-def test_from_a_checkpoint_of_stage_two_everything_trains_again(
-    photographs, trained, tmp_path, stage
-):
+def test_from_a_checkpoint_of_stage_two_all_trains_again(photographs, trained, tmp_path, stage):
     start, out = trained / "chkpnt16.pth", tmp_path / "out"
     more = ["--start_checkpoint", start, "--checkpoint_iterations", 21]
     settings = replace(SETTINGS, train="all")
@@ -185,9 +181,7 @@ def test_from_a_checkpoint_of_stage_two_everything_trains_again(
     assert moved(start, out / "chkpnt21.pth") == set(NAMES) - {"f_rest"}
 
 
-def test_a_stage_two_that_began_from_a_ply_writes_checkpoints_of_the_host(
-    photographs, trained, tmp_path
-):
+def test_a_stage_two_from_a_ply_writes_checkpoints_of_the_host(photographs, trained, tmp_path):
     (tmp_path / ply(12)).parent.mkdir(parents=True)
     shutil.copy(trained / ply(12), tmp_path / ply(12))
     words = command(photographs, tmp_path, 12, "--checkpoint_iterations", 16)
@@ -209,9 +203,7 @@ def test_a_checkpoint_that_cannot_be_read_is_one_stated_error(photographs, out, 
     assert "\n" not in str(caught.value)
 
 
-def test_stage_two_does_not_take_an_earlier_runs_checkpoint_for_its_own_stage_one(
-    photographs, out, tmp_path
-):
+def test_stage_two_takes_no_earlier_runs_checkpoint_for_its_own(photographs, out, tmp_path):
     """Hosts refuse with exit code 0 too, and the folder holds what they should have written."""
     words = command(photographs, out, 10)
     host = Path(shutil.copytree(HOST, tmp_path / "host"))

@@ -182,9 +182,7 @@ def measured(
         *(({}, {"stop": stop}, True) for stop in (None, "auto", 0.02)),
     ],
 )
-def test_a_control_is_quoted_only_of_the_same_training_without_a_stop(
-    tmp_path, control, run, quoted
-):
+def test_a_control_is_quoted_only_of_one_training_without_a_stop(tmp_path, control, run, quoted):
     path = records.leave(tmp_path / "control.ply", "finetune", measured("control", **control))
     found = records.control_of(measured("pressure", **run), [tmp_path / "none", path])
     assert (found is not None) == quoted

@@ -45,9 +45,7 @@ def test_the_first_process_writes_and_reports_and_the_others_say_nothing(tuning,
 
 
 @pytest.mark.parametrize(("size", "killed"), [(2, 0), (3, 1)])
-def test_a_kill_of_one_ends_all_with_one_error_and_leaves_what_was_saved(
-    tuning, tmp_path, size, killed
-):
+def test_a_kill_of_one_ends_all_with_one_error_and_keeps_saves(tuning, tmp_path, size, killed):
     out = tmp_path / "out.ply"
     run_json(*tuning(out, "--iters", 3))
     before, files = out.read_bytes(), names(tmp_path)

@@ -206,9 +206,7 @@ def listed(output):
         ((0,), 4, True),  # a part of the photographs
     ],
 )
-def test_a_training_that_held_other_views_out_has_seen_ours(
-    listed, tmp_path, caplog, held, of, seen
-):
+def test_a_training_that_held_others_out_has_seen_ours(listed, tmp_path, caplog, held, of, seen):
     words = ("--out", tmp_path / "r.ply", "--iters", 2, "--train", "opacity")
     assert run_json("finetune", listed(held, of=of), *words)["seen"] is seen
     assert ("held out other views, of" in caplog.text) is seen
@@ -232,9 +230,7 @@ def test_a_training_whose_cameras_were_elsewhere_is_warned_of(listed, tmp_path, 
 
 
 @pytest.mark.parametrize(("gain", "refused"), [(1.0, False), (1.2, True)])
-def test_a_model_learns_no_photograph_that_it_shows_under_an_exposure(
-    output, tmp_path, gain, refused
-):
+def test_a_model_learns_no_photograph_it_shows_under_an_exposure(output, tmp_path, gain, refused):
     rows = (gain * torch.eye(3, 4)).tolist()
     (output / "exposure.json").write_text(json.dumps({"view00": rows}))
     words = ("finetune", output, "--out", tmp_path / "r.ply", "--iters", 2)

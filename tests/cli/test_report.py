@@ -156,9 +156,7 @@ def test_models_and_photographs_are_found_where_the_whole_tree_was_moved_to(fine
         ("out/a.ply", "out/a.ply"),
     ],
 )
-def test_a_record_in_the_home_folder_names_neither_it_nor_a_user(
-    tmp_path, monkeypatch, text, written
-):
+def test_a_record_in_the_home_folder_names_no_user(tmp_path, monkeypatch, text, written):
     home = tmp_path / "home/jo"
     (home / "out").mkdir(parents=True)
     monkeypatch.setenv("HOME", str(home))

@@ -88,7 +88,7 @@ def test_the_host_takes_as_many_threads_as_it_is_given(words, threads, monkeypat
         ("chkpnt16.pth", (), False),  # RT-4DGS
     ],
 )
-def test_a_page_is_advised_only_of_a_model_that_view_shows(
+def test_a_page_is_advised_only_where_view_shows(
     name, beside, shown, trained, tmp_path, monkeypatch
 ):
     found, model = trained[1], tmp_path / name
@@ -212,9 +212,7 @@ def test_a_finished_stage_two_says_so_and_runs_nothing(folder):
     assert ran(*finetune, "--pressure", 2e-3, *words)["already_finished"] is False
 
 
-def test_a_model_that_knows_its_photographs_by_heart_is_told_and_learns_otherwise(
-    scene, tmp_path, monkeypatch
-):
+def test_a_model_that_knows_photographs_by_heart_is_told(scene, tmp_path, monkeypatch):
     out = tmp_path / "out"
     words = command(scene, out, "--densify_until_iter", 8)
     monkeypatch.setattr(trial, "forgotten", lambda *_, **__: trial.BY_HEART)
@@ -244,9 +242,7 @@ FULL = torch.cuda.OutOfMemoryError(
         ((work, "kept"), ModelFileError("out", "a stand-in", "another", "Nothing.")),
     ],
 )
-def test_where_a_look_fails_stage_two_learns_as_asked(
-    scene, tmp_path, monkeypatch, caplog, where, error
-):
+def test_where_a_look_fails_we_learn_as_asked(scene, tmp_path, monkeypatch, caplog, where, error):
     def fail(*_, **__):
         raise error
 

@@ -88,7 +88,7 @@ def test_it_trains_as_it_is_and_its_model_learns_after(host, photographs, tmp_pa
     assert json.loads(again.stdout)["control"] == json.loads(zero.stdout)["after"]
 
 
-def test_a_model_that_is_not_to_show_its_photographs_learns_from_its_own_pictures(
+def test_a_model_unlike_its_photographs_learns_from_its_pictures(
     host, photographs, tmp_path, trained
 ):
     words = host(photographs, shown="water * ")
@@ -114,9 +114,7 @@ def test_a_model_with_exposures_learns_from_its_own_pictures(host, photographs, 
 
 
 @pytest.mark.parametrize(("old", "new"), [("/cfg_args", "/other_args"), ("source_path=", "")])
-def test_without_its_arguments_photographs_are_read_as_the_command_says(
-    host, photographs, tmp_path, old, new
-):
+def test_without_arguments_photographs_are_read_as_we_say(host, photographs, tmp_path, old, new):
     words = host(photographs)
     script = words[2]
     script.write_text(script.read_text().replace(old, new))
@@ -143,9 +141,7 @@ def test_what_a_host_makes_of_its_model_in_a_folder_below_is_not_taken(host, pho
     assert data["model_before"] == str(tmp_path / "out/point_cloud/iteration_9/point_cloud.ply")
 
 
-def test_a_model_in_another_folder_may_be_another_trainings(
-    host, photographs, tmp_path, monkeypatch
-):
+def test_a_model_in_another_folder_may_be_anothers(host, photographs, tmp_path, monkeypatch):
     words = host(photographs)
     script = words[2]
     script.write_text(script.read_text().replace("sys.argv[2], sys.argv[4]", "sys.argv[2], 'own'"))
@@ -246,9 +242,7 @@ def test_what_only_an_adapter_can_do_is_refused(more, host, photographs, tmp_pat
     assert not (tmp_path / "out").exists()
 
 
-def test_several_processes_are_refused_before_the_training(
-    host, photographs, tmp_path, monkeypatch
-):
+def test_several_processes_are_refused_before_it_trains(host, photographs, tmp_path, monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "2")
     fails("run", *WORDS, *host(photographs), says="several processes")
     assert not (tmp_path / "out").exists()
@@ -259,9 +253,7 @@ def test_photographs_that_we_cannot_read_are_said_before_the_training(host, tmp_
     assert not (tmp_path / "out").exists()
 
 
-def test_a_script_that_trains_another_model_than_was_read_is_not_trained(
-    host, photographs, tmp_path
-):
+def test_a_script_that_trains_another_model_than_read_is_not_run(host, photographs, tmp_path):
     words = host(photographs)
     text = words[2].read_text()
     words[2].write_text(f"{text}\nfrom scene.flat import FlatGaussianModel\n")

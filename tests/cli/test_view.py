@@ -69,9 +69,7 @@ def test_two_models_of_one_file_name_are_told_apart(data, model, page):
 
 
 @pytest.mark.parametrize("there", [True, False])
-def test_the_original_that_a_record_names_stands_left_if_it_lies_in_the_same_folder(
-    cut, page, tmp_path, there
-):
+def test_the_original_of_a_record_stands_left_if_it_lies_beside(cut, page, tmp_path, there):
     original = (tmp_path if there else tmp_path.parent) / "before.ply"
     write_ply(original, tiny.random_model(20))
     records.leave(cut, "finetune", {"model": str(original), "out": str(cut)})

@@ -67,9 +67,7 @@ difference and form of it.
 
 
 @pytest.mark.parametrize("cousin", COUSINS)
-def test_what_draws_or_trains_otherwise_is_not_vanilla_whichever_adapters_there_are(
-    tmp_path, cousin
-):
+def test_what_draws_or_trains_otherwise_is_not_vanilla(tmp_path, cousin):
     repo = skeleton(tmp_path, **COUSINS[cousin])
     assert {f.code for f in errors(repo)} <= {"rasterizer-call", "param-groups"}
     for adapters in ([Vanilla3DGS()], load_plugins().adapters):
@@ -232,9 +230,7 @@ def test_an_installed_package_is_read_where_it_lies_and_not_imported(package):
         ("import numpy", "toy_host", True),
     ],
 )
-def test_a_script_that_imports_an_installed_host_is_its_script(
-    tmp_path, package, code, name, found
-):
+def test_a_script_importing_an_installed_host_is_its_script(tmp_path, package, code, name, found):
     scripts = tmp_path / "own"
     scripts.mkdir()
     (scripts / "mine.py").write_text(code)

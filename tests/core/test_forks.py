@@ -693,9 +693,7 @@ def test_pictures_of_a_network_are_not_compared(tmp_path):
 
 
 @pytest.mark.parametrize(("shown", "compared"), [("", True), ("water * ", False)])
-def test_pictures_that_are_not_to_be_like_the_photographs_are_not_compared(
-    tmp_path, shown, compared
-):
+def test_pictures_that_are_not_to_be_like_photographs_are_not_compared(tmp_path, shown, compared):
     loss = f"loss = ssim({shown}package['render'], camera.original_image)"
     repo = fork(tmp_path, ("        loss.backward()", f"        {loss}\n        loss.backward()"))
     assert errors(repo) == []

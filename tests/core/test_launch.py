@@ -354,9 +354,7 @@ def test_after_ctrl_c_in_stage_two_the_same_command_does_not_repeat_stage_one(in
 
 
 @pytest.mark.parametrize("changed", ["the command", "the script", "the checkpoint", "a wish"])
-def test_stage_one_is_repeated_where_it_is_not_known_to_be_the_same(
-    interrupted, monkeypatch, changed
-):
+def test_stage_one_is_repeated_where_it_may_be_another(interrupted, monkeypatch, changed):
     words, out, _ = interrupted
     options = replace(AUTO, again=changed == "a wish")
     if changed == "the command":
@@ -423,9 +421,7 @@ def test_after_ctrl_c_a_folder_that_only_the_host_named_is_named(host, tmp_path,
     assert "with --stage finetune and --model_path named: stage 2" in caught.value.remedy
 
 
-def test_a_gpu_that_no_engine_of_ours_draws_on_is_refused_before_the_training(
-    host, tmp_path, monkeypatch
-):
+def test_a_gpu_that_no_engine_of_ours_draws_on_is_refused_first(host, tmp_path, monkeypatch):
     script = host(f"open({str(tmp_path / 'trained')!r}, 'w')\n")
     monkeypatch.setattr(process, "host_device", lambda wanted, engine: "cuda")
     monkeypatch.setattr(driver, "missing", lambda: "no NVRTC library")

@@ -147,9 +147,7 @@ def test_a_rasterizer_that_draws_otherwise_is_refused(host, difference):
 
 
 @pytest.mark.parametrize("difference", ["absolute gradient", "gradient by pixels"])
-def test_the_gradient_on_the_screen_matters_only_where_ours_draws_for_densification(
-    host, difference
-):
+def test_gradients_on_the_screen_matter_only_where_ours_densifies(host, difference):
     (proved,) = draw(host(difference))
     assert proved.outputs[0].startswith("the picture, with another gradient on the screen")
 

@@ -447,9 +447,7 @@ def test_a_pipe_that_takes_a_files_place_meanwhile_is_not_waited_for(tmp_path, m
         (ValueError("embedded null byte"), "embedded null byte"),
     ],
 )
-def test_a_file_that_the_system_does_not_open_is_named_with_the_reason(
-    tmp_path, monkeypatch, error, why
-):
+def test_a_file_that_cannot_be_opened_is_named_with_the_reason(tmp_path, monkeypatch, error, why):
     def refused(*_):
         raise error
 

@@ -93,9 +93,7 @@ def test_what_was_learned_is_saved_at_the_iteration_that_the_host_reached(steppe
         (False, False, 0, True),
     ],
 )
-def test_a_model_is_saved_only_if_something_was_learned(
-    monkeypatch, neutral, portable, steps, saves
-):
+def test_a_model_is_saved_only_if_it_learned(monkeypatch, neutral, portable, steps, saves):
     with running(
         Settings(iterations=5, goal=Portable() if portable else Pressure()), output=Path("out")
     ) as host:

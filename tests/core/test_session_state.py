@@ -20,9 +20,7 @@ CPU = torch.device("cpu")
 
 
 @pytest.mark.parametrize(("name", "warned"), [("cpu", False), ("reference", True)])
-def test_an_engine_is_opened_once_for_a_device_and_a_slow_one_is_told(
-    monkeypatch, caplog, name, warned
-):
+def test_an_engine_is_opened_once_a_device_and_a_slow_one_told(monkeypatch, caplog, name, warned):
     asked = []
     engine = SimpleNamespace(name=name)
     monkeypatch.setattr(module, "engine_for", lambda *words: asked.append(words) or engine)

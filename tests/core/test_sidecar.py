@@ -57,9 +57,7 @@ def test_a_column_of_the_file_counts_more_than_a_sidecar(tmp_path, trained):
     assert sidecar.thresholds_of(path, 6).values.tolist() == [0.25] * 6
 
 
-def test_a_sidecar_belongs_to_the_file_it_was_written_for_and_is_refused_for_a_later_one(
-    model, trained
-):
+def test_a_sidecar_belongs_to_its_file_and_is_refused_for_a_later_one(model, trained):
     assert not sidecar.belongs(model)
     sidecar.save(model, trained)
     assert sidecar.belongs(model)
@@ -70,9 +68,7 @@ def test_a_sidecar_belongs_to_the_file_it_was_written_for_and_is_refused_for_a_l
 
 
 @pytest.mark.parametrize("rows", [0, 1, 5, 7])
-def test_thresholds_of_other_rows_than_the_models_are_refused_with_both_counts(
-    model, trained, rows
-):
+def test_thresholds_of_other_rows_are_refused_with_both_counts(model, trained, rows):
     sidecar.save(model, trained)
     with pytest.raises(SidecarError, match=f"thresholds of 6 Gaussian.*; expected {rows}, one"):
         sidecar.load(model, rows)
@@ -143,9 +139,7 @@ def test_metadata_that_are_none_are_refused(model, trained, key, value):
         sidecar.load(model, 6)
 
 
-def test_a_place_that_cannot_be_written_is_stated_and_the_old_sidecar_stays(
-    model, trained, monkeypatch
-):
+def test_a_place_that_cannot_be_written_is_stated_and_the_old_stays(model, trained, monkeypatch):
     path = sidecar.save(model, trained)
     before = path.read_bytes()
 

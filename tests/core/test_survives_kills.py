@@ -119,9 +119,7 @@ def test_after_a_death_at_any_change_the_old_pair_or_the_new_one_is_there(tmp_pa
     assert turn > 4
 
 
-def test_each_file_is_on_the_disk_before_its_name_and_each_name_before_the_next(
-    tmp_path, monkeypatch
-):
+def test_each_file_is_on_disk_before_its_name_and_that_before_the_next(tmp_path, monkeypatch):
     done: list[tuple[str, object]] = []
     fsync, replace = os.fsync, os.replace
 
@@ -233,9 +231,7 @@ def test_a_sidecar_at_its_address_counts_for_that_content_alone(tmp_path):
 
 
 @pytest.mark.parametrize("failing", [1, 2, 3])
-def test_a_full_disk_at_any_rename_leaves_a_whole_pair_and_nothing_else(
-    tmp_path, monkeypatch, failing
-):
+def test_a_full_disk_at_any_rename_leaves_a_whole_pair_alone(tmp_path, monkeypatch, failing):
     path, count, replace = tmp_path / "a.ply", 0, os.replace
     save(path, 1)
 

@@ -498,9 +498,7 @@ def test_run_is_named_where_it_would_train(fork, tmp_path, inner):
     ("given", "kind"), [("dx=None", "finetune"), ("dx=dx", "never"), ("False, None, dx", "never")]
 )
 @pytest.mark.parametrize("inner", ["", "inner"])
-def test_an_argument_that_moves_gaussians_is_off_only_if_no_file_gives_it(
-    fork, tmp_path, inner, given, kind
-):
+def test_an_argument_that_moves_them_is_off_if_no_file_gives_it(fork, tmp_path, inner, given, kind):
     moved = "    means3D = pc.get_xyz\n", MOVES
     fork(("override_color=None):", "override_color=None, dx=None):"), moved, root=tmp_path / inner)
     (tmp_path / "slam.py").write_text(f"package = render(camera, model, pipe, bg, {given})\n")

@@ -26,9 +26,7 @@ def seen(folder, name):
 
 
 @pytest.mark.parametrize(("views", "width", "points"), [(48, 320, 4000), (9, 80, 1000)])
-def test_points_have_the_colours_of_the_photographs_where_the_cameras_see_them(
-    tmp_path, views, width, points
-):
+def test_points_have_the_photographs_colours_where_cameras_see(tmp_path, views, width, points):
     scene.make_scene(tmp_path, views=views, width=width, points=points)
     dataset = load_dataset(tmp_path)
     assert len(dataset.train) + len(dataset.test) == views

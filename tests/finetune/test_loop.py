@@ -230,9 +230,7 @@ def test_calibration_keeps_the_nearest_end_when_out_of_reach():
     assert calls[-1] > calls[0]
 
 
-def test_a_target_time_that_no_threshold_reaches_is_refused_before_any_work(
-    model, dataset, monkeypatch
-):
+def test_a_target_time_that_no_threshold_reaches_is_refused_first(model, dataset, monkeypatch):
     tiny.exact_clock(monkeypatch, base=1e3)
     with pytest.raises(UsageError, match=r"less than 1\.\d\dx"):
         finetune(model, dataset, Settings(iterations=9, goal=Faster(1.5)), engine="cpu")

@@ -72,7 +72,7 @@ def warming_up(patch):
         *("warm-up", "target time"),
     ],
 )
-def test_cut_off_again_and_again_it_ends_as_if_never_cut(
+def test_cut_off_often_it_ends_as_never_cut(
     model, dataset, tmp_path, monkeypatch, settings, prepare
 ):
     if prepare:
@@ -224,9 +224,7 @@ def test_a_broken_checkpoint_is_stated(model, dataset, unfinished, tmp_path, how
     assert "--again" in caught.value.remedy
 
 
-def test_a_full_disk_costs_the_checkpoint_and_not_the_fine_tuning(
-    model, dataset, tmp_path, monkeypatch
-):
+def test_a_full_disk_costs_the_checkpoint_not_the_training(model, dataset, tmp_path, monkeypatch):
     told = []
 
     def full(*_, **__):

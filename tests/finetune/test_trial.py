@@ -145,9 +145,7 @@ def test_of_a_pruned_model_no_gaussian_is_removed(command, tmp_path):
         (("--max-drop", 5), None),
     ],
 )
-def test_nothing_is_tried_where_somebody_chose_or_nothing_is_to_be_chosen(
-    command, options, dropout
-):
+def test_nothing_is_tried_where_somebody_chose_or_nothing_may_be(command, options, dropout):
     report = command(None, *options)
     assert report["settings"]["dropout"] == dropout
     assert report["forgotten"] is None

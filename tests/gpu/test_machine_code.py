@@ -80,9 +80,7 @@ def test_a_loop_is_what_lies_between_a_label_and_a_branch_back():
 
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
 @pytest.mark.parametrize("source", SOURCES)
-def test_a_step_takes_no_more_instructions_than_it_did(
-    nvrtc, nvdisasm, tmp_path, source, architecture
-):
+def test_a_step_takes_no_more_instructions_now(nvrtc, nvdisasm, tmp_path, source, architecture):
     image = nvrtc.compile(source, {**MACROS, **SOURCES[source]}, f"sm_{architecture}")
     (tmp_path / "kernels.cubin").write_bytes(image.code)
     found = kernels_of(nvdisasm, tmp_path / "kernels.cubin")

@@ -72,9 +72,7 @@ def test_a_damaged_memory_is_none(checks, kept):
     assert why_not("cuda") == FAILS
 
 
-def test_a_folder_that_cannot_be_written_leaves_the_check_to_each_process(
-    checks, tmp_path, monkeypatch
-):
+def test_a_folder_that_cannot_be_written_leaves_it_to_each_process(checks, tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     monkeypatch.setenv(kernels.CACHE, str(tmp_path / "file" / "folder"))
     checks += [AGREES, AGREES]
@@ -147,9 +145,7 @@ def test_crashes_and_hangs_stay_in_a_process_of_their_own(monkeypatch, program, 
     ],
     ids=str,
 )
-def test_what_went_wrong_is_told_from_what_could_not_be_tried(
-    monkeypatch, capsys, found, status, said
-):
+def test_what_went_wrong_is_told_from_what_was_untried(monkeypatch, capsys, found, status, said):
     def compare(gpu: object, where: torch.device) -> list:
         if isinstance(found, Exception):
             raise found

@@ -36,9 +36,7 @@ def counting(device: EmulatedDevice, tmp_path_factory: pytest.TempPathFactory) -
         ("fp_shared_fours", "shared", 8, 256, 32, 32),
     ],
 )
-def test_sectors_and_turns_are_those_of_the_pattern(
-    counting, kernel, kind, requests, lanes, units, least
-):
+def test_sectors_and_turns_are_the_patterns(counting, kernel, kind, requests, lanes, units, least):
     room = torch.zeros(8 * 256 + 8, dtype=torch.int32)
     place = -(-room.data_ptr() // 32) * 32  # a sector begins there
     counting.launch(room.device, "patterns", {}, kernel, 3, Numbers(to=place))

@@ -165,9 +165,7 @@ def alone(tmp_path_factory):
     [*((hook, RuntimeError("disk full")) for hook in OBSERVERS), ("fragprune_step", SystemExit(7))],
     ids=str,
 )
-def test_an_observer_that_raises_is_switched_off_and_the_run_goes_on(
-    hook, error, alone, tmp_path, caplog
-):
+def test_an_observer_that_raises_is_off_and_the_run_goes_on(hook, error, alone, tmp_path, caplog):
     told, calls = [], []
 
     def act():

@@ -400,9 +400,7 @@ def test_thresholds_of_a_file_wait_while_another_model_is_drawn(session_on, tmp_
 
 @pytest.mark.parametrize("nested", [True, False])
 @pytest.mark.parametrize("learn", [True, False])
-def test_torch_saves_and_loads_parameters_with_their_thresholds(
-    session_on, tmp_path, nested, learn
-):
+def test_torch_saves_and_loads_parameters_with_thresholds(session_on, tmp_path, nested, learn):
     file, logits = tmp_path / "splats.pt", torch.randn(40)
 
     def loaded():
@@ -480,9 +478,7 @@ def documented(folder: str, words: list[str]) -> str:
 
 
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
-def test_the_documented_loop_runs_and_exports_its_thresholds(
-    folder, photographs, tmp_path, strategy
-):
+def test_the_documented_loop_runs_and_exports_thresholds(folder, photographs, tmp_path, strategy):
     def loop(*words: object) -> None:
         words = (LOOP, photographs, *words, "--strategy", strategy)
         assert "fragments per pixel" in fresh(

@@ -59,9 +59,7 @@ def test_its_own_constants_are_those_of_the_core():
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 @pytest.mark.parametrize("scene", [scenes.empty, scenes.behind_camera])
 @pytest.mark.parametrize("thresholds", [False, True])
-def test_where_nothing_is_drawn_only_the_background_is_there_and_has_a_gradient(
-    scene, dtype, thresholds
-):
+def test_where_nothing_is_drawn_the_background_alone_has_a_gradient(scene, dtype, thresholds):
     inputs, leaves = scenes.leaves(scene(dtype=dtype))
     count = len(inputs.splats)
     tau = torch.full((count,), 0.1, dtype=dtype, requires_grad=True) if thresholds else None

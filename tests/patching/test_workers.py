@@ -77,9 +77,7 @@ def trained(root: Path, scene: Path, options: RunOptions) -> tuple[bytes, list[f
 
 
 @pytest.mark.parametrize("kind", ["fork", "spawn"])
-def test_workers_load_the_hosts_views_and_draw_with_thresholds_or_are_refused(
-    kind, photographs, tmp_path
-):
+def test_workers_load_views_and_draw_with_thresholds_or_are_refused(kind, photographs, tmp_path):
     """A forked worker knows the thresholds of its moment; a spawned one has none."""
     root = written(Host, tmp_path / "host")
     (root / "watching.py").write_text(WORKERS)

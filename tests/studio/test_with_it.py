@@ -190,9 +190,7 @@ def test_the_crop_box_of_the_viewer_draws_with_the_thresholds_of_its_rows(run):
 
 
 @pytest.mark.parametrize("load", ["load_dir", "load_checkpoint"])
-def test_a_training_that_is_resumed_goes_on_with_its_thresholds(
-    run, methods, scene, tmp_path, load
-):
+def test_a_training_that_is_resumed_keeps_its_thresholds(run, methods, scene, tmp_path, load):
     _, checkpoint, _, store, counts = run
     config = configured(methods, scene, tmp_path)
     setattr(config, load, checkpoint.parent if load == "load_dir" else checkpoint)
@@ -267,9 +265,7 @@ def test_what_does_not_learn_stays_as_it_is_to_the_bit(run, methods, scene, tmp_
         (50, {"fragprune": Learning(goal="faster=1.5")}, "fewer fragments"),
     ],
 )
-def test_a_training_in_which_nothing_can_be_learned_is_refused(
-    methods, scene, tmp_path, length, model, remedy
-):
+def test_a_training_that_learns_nothing_is_refused(methods, scene, tmp_path, length, model, remedy):
     config = configured(methods, scene, tmp_path, **model)
     config.max_num_iterations = length
     with pytest.raises(UsageError, match=re.escape(remedy)):
@@ -329,9 +325,7 @@ def test_a_second_ctrl_c_waits_for_no_iteration_and_saves_no_half_of_one(
     assert not list(tmp_path.rglob("*.ckpt"))
 
 
-def test_ctrl_c_in_the_training_before_stage_two_saves_it_too(
-    methods, scene, tmp_path, monkeypatch, ctrl_c
-):
+def test_ctrl_c_before_stage_two_saves_it_too(methods, scene, tmp_path, monkeypatch, ctrl_c):
     from nerfstudio.models.splatfacto import SplatfactoModel
 
     original = SplatfactoModel.step_post_backward
@@ -350,9 +344,7 @@ def test_ctrl_c_in_the_training_before_stage_two_saves_it_too(
     assert torch.load(checkpoint, map_location="cpu")["step"] == 11
 
 
-def test_ctrl_c_after_the_training_closes_the_viewer_as_ever(
-    methods, scene, tmp_path, monkeypatch, ctrl_c
-):
+def test_ctrl_c_after_it_closes_the_viewer_as_ever(methods, scene, tmp_path, monkeypatch, ctrl_c):
     from nerfstudio.engine.trainer import Trainer
 
     config = configured(methods, scene, tmp_path)
