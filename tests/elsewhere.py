@@ -107,11 +107,7 @@ def moved(value: Any, device: torch.device | str) -> Any:
 
 
 class Engine:
-    """Draws only what is wholly elsewhere.
-
-    Attributes:
-        frames: drawn so far.
-    """
+    """Draws only what is wholly elsewhere, and counts frames."""
 
     name = "elsewhere"
 

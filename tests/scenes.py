@@ -41,22 +41,8 @@ def random_scene(
 
     Of each ten, one touches a tile border, one lies off the image, and one is behind the near plane
     or the camera. Opacities run from 0.02 to 0.999, some colour channels clamp at zero, and the
-    first two share a mean, hence a depth.
-
-    Args:
-        seed: of the whole scene.
-        n: Gaussians; 0 is allowed.
-        width: pixels.
-        height: pixels.
-        sh_degree: 0 to 3; ``sh`` always has all 16 coefficients.
-        colors: give RGB colours instead of ``sh``.
-        cov3d: give 3D covariances instead of scales and rotations.
-        flat: give two scales each: surfels.
-        features: channels to blend beside colour; 0 for none.
-        offsets: give sample offsets of up to half a pixel.
-        dtype: of every tensor.
-        device: of every tensor.
-        dialect: further fields of ``RasterInputs``.
+    first two share a mean, hence a depth. ``sh`` has 16 coefficients in every degree; flat ones are
+    surfels; sample offsets reach half a pixel; ``dialect`` has more fields of ``RasterInputs``.
     """
     generator = torch.Generator().manual_seed(seed)
     view = random_view(generator, width, height)
@@ -123,17 +109,8 @@ def one_splat(
 ) -> RasterInputs:
     """One flat splat facing an untransformed camera: every pixel can be computed by hand.
 
-    Args:
-        pixel: where its mean lands; (0, 0) is the centre of the first pixel.
-        width: pixels.
-        height: pixels.
-        sigma: standard deviations in the image before dilation, pixels.
-        angle: from the image's x axis to the first of them, radians.
-        depth: view-space depth.
-        opacity: before any compensation.
-        color: RGB.
-        background: RGB.
-        dtype: of every tensor.
+    Pixel (0, 0) is the centre of the first one; sigmas are pixels before dilation, the angle is
+    from x to the first of them in radians, opacity is before any compensation.
     """
     view = _plain_view(width, height, background)
     at = torch.tensor([pixel], dtype=torch.float64)

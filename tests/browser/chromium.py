@@ -73,11 +73,7 @@ def served(folder: Path) -> Iterator[str]:
 
 @contextmanager
 def chromium(*flags: str) -> Iterator[Any]:
-    """Start Chromium with an empty profile of its own; playwright's browser.
-
-    Args:
-        flags: of the command line, beside ``FLAGS``.
-    """
+    """Start Chromium, by these flags and ``FLAGS``, with an empty profile; playwright's browser."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as driver:
@@ -90,13 +86,9 @@ def chromium(*flags: str) -> Iterator[Any]:
 
 @dataclass
 class Tab:
-    """One open page.
+    """One open page; what went wrong in it; the addresses beyond its origin that it asked in vain.
 
-    Attributes:
-        page: playwright's page. Its ``wait_for_function`` needs a function, "() => ready": a page's
-            policy allows no other string.
-        errors: what went wrong in it: exceptions, console errors, requests that failed.
-        strangers: addresses beyond the page's own origin that it asked for; none was answered.
+    Playwright's ``wait_for_function`` needs a function: a page's policy allows no other string.
     """
 
     page: Any
@@ -144,15 +136,9 @@ class Tab:
 def opened(
     browser: Any, address: str, *, width: int = 1280, height: int = 720, **context: Any
 ) -> Iterator[Tab]:
-    """Open a page that gets nothing from anywhere but its own origin.
+    """Open a page that gets nothing from anywhere but its own origin, in CSS pixels.
 
-    Args:
-        browser: from ``chromium``.
-        address: of the page.
-        width: of the window, CSS pixels.
-        height: of the window, CSS pixels.
-        context: more options of playwright's ``new_context``, such as ``color_scheme="dark"``,
-            ``has_touch=True``, ``device_scale_factor=3``.
+    ``context`` goes to playwright's ``new_context``, as ``color_scheme="dark"``.
     """
     home = urlsplit(address)[:2]
     held = browser.new_context(viewport={"width": width, "height": height}, **context)

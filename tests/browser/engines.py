@@ -39,11 +39,7 @@ class NoEnginesError(Exception):
 
 @cache
 def engines() -> Path:
-    """A folder with the engines as npm installs them; kept between runs.
-
-    Raises:
-        NoEnginesError: they cannot be installed here.
-    """
+    """A folder with the engines as npm installs them, kept between runs, or NoEnginesError."""
     names = [f"{name}@{version}" for name, version in PACKAGES.items()]
     key = "-".join(name.replace("/", "-") for name in names)
     folder = Path(tempfile.gettempdir()) / f"fragprune-{key}"
@@ -55,11 +51,7 @@ def engines() -> Path:
 
 
 def install(folder: Path, *what: str) -> None:
-    """Let npm install packages into a folder.
-
-    Raises:
-        NoEnginesError: it cannot.
-    """
+    """Let npm install packages into a folder, or raise NoEnginesError."""
     command = ["npm", "install", "--no-audit", "--no-fund", "--fetch-retries=1", *what]
     try:
         subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=120, check=True)
@@ -92,13 +84,8 @@ class Page:
 def drawing(browser: Any, engine: str, model: Path, view: View, **options: Any) -> Iterator[Page]:
     """Open a page in which an engine has drawn a model, and expect no error of it.
 
-    Args:
-        browser: from ``chromium``.
-        engine: "playcanvas" on WebGL 2, "playcanvas-webgpu", "playcanvas-webgpu-cpu" with the
-            renderer that sorts on the CPU, or "spark".
-        model: PLY, or what the engine reads besides.
-        view: the camera; its principal point is the centre, and both focal lengths are equal.
-        options: of ``playcanvas.js`` or ``spark.js``.
+    The view's principal point is the centre, and both its focal lengths are equal; options are
+    those of ``playcanvas.js`` or ``spark.js``.
     """
     engine, *device = engine.split("-")
     fov_y = float(2 * np.degrees(np.arctan(view.tan_fov_y)))

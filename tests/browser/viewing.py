@@ -17,12 +17,9 @@ from fragprune_plugins.workbench.view.site import Layer, camera, make_site, save
 
 @dataclass(frozen=True)
 class Frame:
-    """One picture of the page, rows from the top.
+    """One picture of the page, rows from the top: (H, W, 3) RGB in [0, 1].
 
-    Attributes:
-        image: (H, W, 3) RGB in [0, 1], of 8 bits.
-        quads: (H, W) how often a quad covered each pixel.
-        fragments: (H, W) how often a fragment was drawn there.
+    ``quads`` and ``fragments``, (H, W), count how often one covered each pixel or was drawn there.
     """
 
     image: np.ndarray

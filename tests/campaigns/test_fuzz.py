@@ -1,7 +1,4 @@
-"""Broken files: every reader reads its seeds, states what is wrong with others, and nothing else.
-
-Seconds of it; ``python -m campaigns.fuzz`` has the hours.
-"""
+"""Seconds of broken files: each is read, or refused with what is wrong; see docs/how-to/fuzz.md."""
 
 import os
 import shutil

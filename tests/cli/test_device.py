@@ -1,7 +1,4 @@
-"""Every command that draws has model, thresholds and views on the device that was chosen.
-
-There is no GPU here: a device that is none stands for one.
-"""
+"""Every command that draws works on the chosen device; one that is none stands for a GPU."""
 
 import json
 

@@ -1,7 +1,4 @@
-"""The site is built strictly, with the tutorial run; all that it refers to is there, offline.
-
-It needs the extra [docs].
-"""
+"""The site is built strictly, with the tutorial run; all that it refers to is there, offline."""
 
 import json
 import os

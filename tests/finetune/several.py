@@ -1,7 +1,4 @@
-"""Several processes as ``torchrun`` starts them, but forked: they need no second to import torch.
-
-A child of its own keeps the store, as torchrun's agent does, so that it outlives any of them.
-"""
+"""Several processes as ``torchrun`` starts them, but forked; the store outlives each."""
 
 import contextlib
 import math
@@ -166,10 +163,7 @@ def lose_nan(ranks: Any) -> None:
 def command(
     size: int, *words: object, prepare: Callable[[int], object] = lambda _: None
 ) -> list[Ended]:
-    """The command line in each process: it leaves its exit code, stdout and stderr.
-
-    ``prepare(rank)`` is called in each before.
-    """
+    """The command line in each process after ``prepare(rank)``: exit code, stdout and stderr."""
 
     def one(rank: int) -> Any:
         signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -28,12 +28,7 @@ class Numbers(ctypes.Structure):
 
 @dataclass(eq=False)  # a device is one by itself
 class Watched:
-    """The emulation, and somebody who looks at, or tampers with, what its kernels did.
-
-    Attributes:
-        device: the emulation.
-        after: called after each launch, with the kernel's name and arguments.
-    """
+    """The emulation; after each launch, ``after`` gets the kernel's name and arguments."""
 
     device: EmulatedDevice
     after: Callable[[str, ctypes.Structure], None]

@@ -36,12 +36,7 @@ def checkouts(name: str) -> list[Path]:
 
 
 def each_of(name: str, *more: object) -> list:
-    """Parameters of a test for every checkout of an adapter; one that is skipped if there is none.
-
-    Args:
-        name: the adapter's.
-        more: further parameters.
-    """
+    """Parameters for every checkout of an adapter; one that is skipped if there is none."""
     reason = f"FRAGPRUNE_HOSTS names no folder with a checkout of {name} in it"
     none = pytest.param(None, *more, marks=pytest.mark.skip(reason=reason), id=f"no {name}")
     return [pytest.param(path, *more, id=path.name) for path in checkouts(name)] or [none]

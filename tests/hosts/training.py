@@ -27,14 +27,9 @@ CAPTURED = {
 
 @dataclass(frozen=True)
 class Learned:
-    """What stage 2 left.
+    """What stage 2 left: the tensors that moved, by name, and the models' files before and after.
 
-    Attributes:
-        moved: the model's tensors that differ, by name.
-        rows: numbers of Gaussians before and after, and of thresholds.
-        steps: of stage 2, and of the thresholds.
-        fragments: per pixel, before and after.
-        models: the files before and after.
+    ``rows`` are of the models and the thresholds, ``steps`` of stage 2 and the thresholds.
     """
 
     moved: list[str]
@@ -47,11 +42,7 @@ class Learned:
 def learned(words: Sequence[str], stage: str, checkpoint: int = 0) -> Learned:
     """Run a host's training script with stage 2.
 
-    Args:
-        words: the script and its flags.
-        stage: of ``fragprune run``.
-        checkpoint: of a host whose training ends in an error of its own after this iteration's
-            checkpoint; stage 2 then begins there.
+    Where a host's training ends in an error of its own, stage 2 begins at the checkpoint before.
     """
     without_torchvision()
     settings = Settings(iterations=STEPS, threshold_lr=0.3, train="opacity")

@@ -132,16 +132,8 @@ def fork(
 ) -> HostRepo:
     """A fork that an extra group and its methods' names tell from vanilla 3DGS.
 
-    Args:
-        root: folder to write to.
-        changes: (old, new) texts in its files.
-        values: that come back from the rasterizer; all but the first two are returned by name.
-        settings: passed to the rasterizer besides vanilla's.
-        arguments: of its call, besides vanilla's.
-        package: the rasterizer's.
-        kernel: CUDA source of the rasterizer; "" if it is not vendored.
-        binding: Python of the rasterizer, where it is vendored.
-        script: name of the training script.
+    ``changes`` replace texts of its files; of ``values`` that the rasterizer returns, all but two
+    go on by name; settings and arguments come after vanilla's; "" as kernel: it is not vendored.
     """
     from miniatures.skeletons import SETTINGS
 

@@ -39,13 +39,7 @@ def written(host: type[Host], root: Path) -> Path:
 
 
 def miniature(host: type[Host], adapter: type, **defaults: type) -> tuple[Any, Any]:
-    """A fixture with the folder of a miniature, and a function for the words of a session there.
-
-    Args:
-        host: writes it.
-        adapter: of the session.
-        defaults: further words, and the classes of their values.
-    """
+    """A fixture with a miniature, and a function for the words of a session there."""
 
     @pytest.fixture(scope="module")
     def mini(tmp_path_factory: pytest.TempPathFactory) -> Path:

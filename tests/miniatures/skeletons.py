@@ -61,16 +61,8 @@ def skeleton(
 ) -> HostRepo:
     """One public state of vanilla 3DGS, or what a host makes of it.
 
-    Args:
-        root: folder to write to.
-        state: whose interface it has.
-        settings: passed to the rasterizer besides vanilla's.
-        arguments: likewise, of the call.
-        outputs: how many values come back; vanilla's by default.
-        package: the rasterizer's.
-        functions: that draw.
-        groups: of parameters, in the optimizer.
-        methods: added to the model's, changed or (None) dropped.
+    Settings and arguments come after vanilla's; methods are added to the model's, changed or (None)
+    dropped; ``functions`` draw, and so many ``outputs`` come back.
     """
     late, early = "2024" in state, state in STATES[:2]
     model = MODEL | {"load_ply": "path, use_train_test_exp=False"} if late else MODEL

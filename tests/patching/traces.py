@@ -126,11 +126,7 @@ def settings() -> dict[str, Any]:
 
 
 class Snapshot:
-    """A process at one moment. It keeps every object, so that no other takes its identity.
-
-    Attributes:
-        objects: the objects by place.
-    """
+    """A process at one moment: its objects by place, kept so that none takes their identity."""
 
     def __init__(self) -> None:
         self.objects, self._settings = objects(), settings()
@@ -139,11 +135,7 @@ class Snapshot:
         self._contents = {place: value for place, value in kept.items() if value is not None}
 
     def differences(self, streams: list[str] | None = None) -> list[str]:
-        """What is not as it was, one line each.
-
-        Args:
-            streams: the expected random streams; None for those of the snapshot.
-        """
+        """What is not as it was, one line each; random streams as expected, or as they were."""
         now, gone = objects(), object()
         said = []
         for place, value in self.objects.items():

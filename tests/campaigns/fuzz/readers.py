@@ -206,12 +206,7 @@ def _arguments(file: Path) -> None:
 
 @dataclass(frozen=True)
 class Reader:
-    """A reader.
-
-    Attributes:
-        name: also the folder of its seeds.
-        read: reads a file of the bytes; raises Nonsense where it gives what nobody can use.
-    """
+    """Its name is also the folder of its seeds; it raises Nonsense for what nobody can use."""
 
     name: str
     read: Callable[[Path], None]

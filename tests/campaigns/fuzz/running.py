@@ -38,12 +38,7 @@ _FORK = multiprocessing.get_context("fork")
 
 @dataclass
 class Tally:
-    """What became of a reader's inputs.
-
-    Attributes:
-        outcomes: how many of each kind.
-        found: (kind, words, input) of each bad one; of like ones the first.
-    """
+    """How many inputs ended in each way; of like bad ones the first: (kind, words, input)."""
 
     outcomes: Counter[str] = field(default_factory=Counter)
     found: dict[tuple[str, str], bytes] = field(default_factory=dict)
@@ -105,14 +100,7 @@ def broken(name: str, pool: list[bytes], seed: int, number: int) -> bytes:
 
 
 def run(reader: Reader, count: int, *, seed: int = 0, seconds: float = 1e9) -> Tally:
-    """Feed up to ``count`` inputs to a reader, for up to so many seconds.
-
-    Args:
-        reader: of READERS.
-        count: inputs.
-        seed: of the inputs.
-        seconds: wall clock, for all.
-    """
+    """Feed up to ``count`` inputs to a reader, for up to so many seconds in all."""
     tally, first, end = Tally(), 0, time.monotonic() + seconds
     memory = "/dev/shm" if os.path.isdir("/dev/shm") else None
     with tempfile.TemporaryDirectory(prefix="fuzz-", dir=memory) as folder:

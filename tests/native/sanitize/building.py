@@ -45,13 +45,7 @@ def shipped_flags(build: str) -> tuple[str, list[str]]:
 
 @dataclass
 class Toolchain:
-    """A compiler and a folder for what it makes.
-
-    Attributes:
-        compiler: the command and its first arguments.
-        folder: where programs go.
-        plain: flags of everything.
-    """
+    """A compiler with its first arguments, a folder for programs, and flags of everything."""
 
     compiler: list[str]
     folder: Path
