@@ -23,9 +23,6 @@ COUNT = 16
 mini, of = miniature(SurfelHost, SurfelSplatting, driver=SurfelHost)
 
 
-# -- the call ------------------------------------------------------------------------------------
-
-
 def test_the_hosts_maps_are_those_of_the_oracle_in_its_order(mini):
     notes = FixedThresholds()
     with joint(**of(mini, plugins=[notes])) as host:
@@ -61,18 +58,12 @@ def test_matrices_in_place_of_scales_are_refused(mini):
             host.render(camera, model)
 
 
-# -- a GPU ---------------------------------------------------------------------------------------
-
-
 def test_a_gpu_is_refused_before_the_training(mini, photographs, tmp_path, monkeypatch):
     monkeypatch.setattr(process, "host_device", lambda wanted, engine: "cuda")
     words = command(mini / "train.py", photographs, tmp_path / "out", 20)
     with pytest.raises(UsageError, match=r"2D Gaussian Splatting.*cuda engine.*--device cpu"):
         run(words, RunOptions(device="cuda"))
     assert not (tmp_path / "out").exists()
-
-
-# -- whole runs ----------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

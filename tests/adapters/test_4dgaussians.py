@@ -61,9 +61,6 @@ def same(one, other):
     return all(torch.equal(one[name], other[name]) for name in one)
 
 
-# -- runs ------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("options", [OPTIONS, EVERYTHING], ids=["opacity", "all"])
 def test_stage_2_goes_on_from_the_fine_phase_alone(mini, photographs, tmp_path, options):
     words = command(mini, photographs, tmp_path / "out")
@@ -166,9 +163,6 @@ def test_a_host_that_starts_itself_again_fails(mini, photographs, tmp_path):
         run(words, replace(OPTIONS, stage="off"))
 
 
-# -- configuration ---------------------------------------------------------------------------------
-
-
 class Config(dict):
     """What mmcv 1 makes of a file of plain dicts."""
 
@@ -256,9 +250,6 @@ def test_the_file_is_read_without_the_hosts_mmcv(mini, photographs, config, tmp_
         run(command(mini, photographs, tmp_path / "out", "--configs", config), OPTIONS)
 
 
-# -- the model and its files -----------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("read", ["truncated", "plain"])
 def test_no_command_of_ours_draws_the_ply_as_if_it_were_the_model(output, read):
     ply = output / "point_cloud" / f"iteration_{LAST}" / "point_cloud.ply"
@@ -291,9 +282,6 @@ def test_rates_that_the_host_sets_in_every_iteration_stay_its_own(mini):
         for name, schedule in model.schedules.items():
             assert rates[name] == schedule(9_000)
         assert rates["opacity"] < host.arguments.opacity_lr
-
-
-# -- the call --------------------------------------------------------------------------------------
 
 
 def test_a_camera_that_is_a_dict_draws_the_same_picture(mini):

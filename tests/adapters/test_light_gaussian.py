@@ -29,9 +29,6 @@ COUNT = 16
 mini, of = miniature(LightGaussianHost, LightGaussian)
 
 
-# -- the counting call ---------------------------------------------------------------------------
-
-
 def brute_force(inputs, thresholds):
     """(N,) fragments of each Gaussian, by loops over floats."""
     splats, counts = naive.splats_of(inputs, thresholds), [0] * len(inputs.splats)
@@ -78,9 +75,6 @@ def test_both_forms_of_the_call_against_brute_force(mini, truncated, size):
     scores += scores
 
 
-# -- rows ----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("bands", [0, 1])
 def test_a_point_cloud_read_with_fewer_bands_has_its_thresholds(mini, tmp_path, bands):
     path = tmp_path / "point_cloud.ply"
@@ -93,9 +87,6 @@ def test_a_point_cloud_read_with_fewer_bands_has_its_thresholds(mini, tmp_path, 
         model.load_ply_sh(str(path), bands)
         expect_ancestors(host, model)
         assert host.render(host.camera(), model)["render"].isfinite().all()
-
-
-# -- stage 2 -------------------------------------------------------------------------------------
 
 
 def test_the_rate_of_stage_two_is_not_the_hosts_schedulers(mini):

@@ -19,9 +19,6 @@ COUNT = 24
 mini, of = miniature(MCMCHost, MCMC)
 
 
-# -- rows ----------------------------------------------------------------------------------------
-
-
 def test_parents_of_a_relocation_are_not_taken_for_those_of_a_later_append(mini):
     with joint(**of(mini)) as host:
         model = host.model(COUNT)
@@ -34,9 +31,6 @@ def test_parents_of_a_relocation_are_not_taken_for_those_of_a_later_append(mini)
         values = host.store(model).values.detach()
         assert len(values) == COUNT + 2
         assert (values[-2:] < 1e-12).all()  # neutral: nobody's children
-
-
-# -- files over the command line -----------------------------------------------------------------
 
 
 def command(mini, scene, out, iterations, *more):

@@ -24,9 +24,6 @@ from fragprune_plugins.plugins.loading import load_plugins
 mini, of = miniature(MiniSplattingHost, MiniSplatting)
 
 
-# -- which host ----------------------------------------------------------------------------------
-
-
 def test_a_scripts_folder_lies_in_its_host(mini):
     adapters = load_plugins().adapters
     repo, adapter = locate(HostRepo(mini / "ms"), adapters)
@@ -34,9 +31,6 @@ def test_a_scripts_folder_lies_in_its_host(mini):
     assert choose(HostRepo(HOST), adapters).name == "vanilla-3dgs"
     with pytest.raises(UnknownHostError, match="no adapter fits"):
         locate(HostRepo(mini / "nowhere" / "deep"), adapters)
-
-
-# -- scores --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("engine", ["reference", "cpu"])
@@ -68,8 +62,6 @@ def test_scores_are_those_of_the_truncated_picture(mini, engine):
     assert truncated["area_proj"].sum() < 0.8 * whole["area_proj"].sum()
     assert torch.equal(truncated["radii"], whole["radii"])  # the host's rule, whatever is drawn
 
-
-# -- runs ----------------------------------------------------------------------------------------
 
 FLAGS = [
     *("--densify_until_iter", 10, "--simp_iteration1", 10, "--simp_iteration2", 13),
@@ -108,8 +100,6 @@ def test_another_package_of_the_hosts_name_is_refused(mini, photographs, tmp_pat
         run(command(mini, photographs, tmp_path / "out", 16), OPTIONS)
     sys.modules.pop("scene", None)
 
-
-# -- compression ---------------------------------------------------------------------------------
 
 PARTS = ("_xyz", "_features_dc", "_features_rest", "_scaling", "_rotation", "_opacity")
 ROWS = [9, 4, 17, 2]

@@ -20,9 +20,6 @@ COUNT = 16
 mini, of = miniature(MipHost, MipSplatting, driver=MipHost)
 
 
-# -- the call ------------------------------------------------------------------------------------
-
-
 def test_filters_and_offsets_reach_the_engine(mini):
     notes = FixedThresholds()
     with joint(**of(mini, plugins=[notes])) as host:
@@ -60,9 +57,6 @@ def test_the_third_gradient_is_the_sum_over_pixels_of_both_others(mini, opened):
     torch.testing.assert_close(whole[:, 2], total, rtol=1e-4, atol=1e-7)
 
 
-# -- rows ----------------------------------------------------------------------------------------
-
-
 def test_a_gradient_that_equals_the_quantile_counts_as_the_host_counts_it(mini):
     """The quantile often is one of the gradients; the norm of one number may be rounded."""
     with joint(**of(mini)) as host:
@@ -75,9 +69,6 @@ def test_a_gradient_that_equals_the_quantile_counts_as_the_host_counts_it(mini):
             model.densify_and_clone(none, 1.0, absolute, quantile, 1e9)
             expected = int((torch.norm(absolute, dim=-1) >= quantile).sum())
             assert len(host.store(model)) == COUNT + expected
-
-
-# -- whole runs ----------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

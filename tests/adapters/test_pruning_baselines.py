@@ -32,9 +32,6 @@ def command(root, *more):
     return runs.command(root / "train.py", *more)
 
 
-# -- Speedy-Splat --------------------------------------------------------------------------------
-
-
 def test_speedys_third_output_is_a_time_that_can_be_divided_by(speedy):
     with joint(path=speedy, adapter=SpeedySplat()) as host:
         times = host.render(host.camera(), host.model(20))["kernel_times"]
@@ -55,9 +52,6 @@ def test_stage_two_of_speedy_prunes_nothing(speedy, photographs, tmp_path):
     more = ["--prune_interval", 14, "--checkpoint_iterations", 12]  # due in stage 2, at 14
     summary = run(command(speedy, photographs, tmp_path, 12, *more), OPTIONS)
     check_stage_two(summary, "speedy-splat")
-
-
-# -- LP-3DGS -------------------------------------------------------------------------------------
 
 
 def test_lp_prunes_by_the_weights_of_what_is_drawn(lp, photographs, tmp_path):
@@ -100,9 +94,6 @@ def test_the_model_with_a_mask_is_refused_before_stage_one(lp, photographs, tmp_
     with pytest.raises(UsageError, match="compact_3dgs"):
         run(command(lp, photographs, tmp_path, 9, "--prune_method", "compact_3dgs"), OPTIONS)
     assert not list(tmp_path.glob("point_cloud/*"))
-
-
-# -- Compact-3DGS --------------------------------------------------------------------------------
 
 
 def test_compact_is_known_by_its_codebooks_and_hash_grid(tmp_path):

@@ -28,9 +28,6 @@ COUNT = 16
 mini, of = miniature(RainHost, RainGS, driver=RainHost)
 
 
-# -- which host, and its rasterizer ----------------------------------------------------------------
-
-
 def test_dilation_reaches_the_engine(mini):
     notes = FixedThresholds()
     with joint(**of(mini, plugins=[notes])) as host, torch.no_grad():
@@ -60,9 +57,6 @@ def test_depth_is_the_sum_of_blended_depths_and_has_no_gradient(name, tmp_path):
     assert package["depth"].any()
     assert not package["depth"].requires_grad
     assert package["render"].requires_grad
-
-
-# -- whole runs ----------------------------------------------------------------------------------
 
 
 def command(mini, scene, out, iterations, *more):

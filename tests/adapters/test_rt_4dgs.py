@@ -36,9 +36,6 @@ def of(mini, driver=None, **options):
     return options_of(mini, driver=driver or RT4DGSHost(), engine="reference", **options)
 
 
-# -- the call --------------------------------------------------------------------------------------
-
-
 def spread_out(model):
     """Gaussians of all shapes and speeds, some of them not there at the camera's moment."""
     generator = torch.Generator().manual_seed(5)
@@ -165,8 +162,6 @@ def test_rows_that_are_not_those_of_the_moment_are_refused_with_both_counts(mini
         assert f"the {there} of {COUNT}" in caught.value.expected
 
 
-# -- runs ------------------------------------------------------------------------------------------
-
 YAML = """
 gaussian_dim: {dim}
 rot_4d: {rot}
@@ -291,9 +286,6 @@ def test_ctrl_c_leaves_a_checkpoint(mini, tmp_path):
         capture, iteration = load(host.save_learned())
         assert iteration == 2
         assert torch.equal(capture[11]["fragprune"]["logits"], host.store(model).logits)
-
-
-# -- small things ----------------------------------------------------------------------------------
 
 
 def test_the_last_section_of_the_file_wins(tmp_path):

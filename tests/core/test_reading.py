@@ -227,9 +227,6 @@ def test_json_is_bounded_in_depth(tmp_path, depth, ends):
             use(path, lambda reading: reading.json(), kind)
 
 
-# -- PLY -----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("content", "words"),
     [
@@ -269,9 +266,6 @@ def test_gaussians_that_cannot_be_drawn_are_refused_with_their_rows(tmp_path, pa
     write_ply(tmp_path / "a.ply", model)
     with pytest.raises(ModelFileError, match=words):
         read_ply(tmp_path / "a.ply")
-
-
-# -- cameras -------------------------------------------------------------------------------------
 
 
 def write_cameras(path, **changed):
@@ -330,9 +324,6 @@ def test_a_lens_that_is_none_is_refused_in_python_too(number):
         View.pinhole(torch.eye(3), torch.zeros(3), width=4, height=4, fx=number, fy=4.0)
     with pytest.raises(InputError, match="fy"):
         Camera(torch.eye(3), torch.zeros(3), 4, 4, 4.0, number, 2.0, 2.0)
-
-
-# -- the rest ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("size", [(20_000, 8_001), (60_000, 60_000), (2**31 - 1, 1)])

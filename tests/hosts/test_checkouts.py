@@ -132,9 +132,6 @@ def test_exposures_of_a_late_host_come_through_stage_two_unchanged(host, dataset
     assert found[0] == found[1]
 
 
-# -- hosts of moving scenes, and the scripts that time their frames --------------------------------
-
-
 def frames(script, host, *words):
     """What a script of docs/how-to says of two models."""
     line = [sys.executable, HOW_TO / script, host, *words, "--rounds", 1, "--device", "cpu"]

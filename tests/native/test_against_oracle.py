@@ -309,8 +309,6 @@ def test_awkward_scenes_equal_the_oracle(engine, case):
     check_gradients(engine, inputs, thresholds, same, 1e-2 + (sigma / 0.55) ** 2 * 2.0**-24)
 
 
-# -- stops on tile borders, images without extent, the near plane ----------------------------------
-
 Drawn = tuple[RasterInputs, torch.Tensor | None]
 
 

@@ -30,8 +30,6 @@ def gaussians():
     }
 
 
-# -- geometry --------------------------------------------------------------------------------------
-
 CONJUGATE = np.array([1, -1, -1, -1])
 
 
@@ -168,8 +166,6 @@ def test_a_slice_has_zeros_for_who_is_not_there_and_feels_nothing_of_them(kind):
     for leaf in leaves.values():
         assert leaf.grad is None or not leaf.grad[absent].any()
 
-
-# -- colour ----------------------------------------------------------------------------------------
 
 SH = random(COUNT, 48, 3, seed=6) * 0.4
 MEANS, MOVED, CAMPOS = random(COUNT, 3, seed=7), random(COUNT, 3, seed=8), random(3, seed=10)

@@ -19,9 +19,6 @@ F64 = torch.float64
 NEAR, FAR = 0.2, 100.0
 
 
-# -- by rays ---------------------------------------------------------------------------------------
-
-
 @dataclass
 class Disc:
     """A surfel and its fragments at all pixels."""
@@ -175,9 +172,6 @@ def test_a_threshold_draws_what_lies_within_its_radius_on_the_plane():
     across, down = counts.any(dim=0).sum(), counts.any(dim=1).sum()
     assert int(down) == 17  # 2 * 1.35 * 6
     assert 8 <= int(across) <= 10  # half of it, in perspective
-
-
-# -- derivatives -----------------------------------------------------------------------------------
 
 
 def test_the_hooks_gradient_is_the_means_along_the_screen():
