@@ -75,9 +75,7 @@ def test_two_models_of_one_script_learn_each_its_own_thresholds(fork, photograph
     assert [each["step"] for each in summary.curves] == list(range(1, 9))
     stores = []
     for name in ("point_cloud", "second"):
-        first, last = (
-            tmp_path / f"out/{name}/iteration_{each}/point_cloud.ply" for each in (13, 21)
-        )
+        first, last = (tmp_path / f"out/{name}/iteration_{i}/point_cloud.ply" for i in (13, 21))
         stores.append(sidecar.load(last)[0])
         assert frozen_differences(first, last) == []
         assert not stores[-1].neutral

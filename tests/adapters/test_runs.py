@@ -197,9 +197,7 @@ def test_a_host_that_learns_and_draws_nothing_is_always_an_error(photographs, tm
 def test_only_a_resumed_run_restores_the_folders(photographs, tmp_path, monkeypatch, from_iter):
     """What an earlier training left there must not overwrite what this one has trained."""
     told = []
-    monkeypatch.setattr(
-        Vanilla3DGS, "prepare_stage2", lambda self, model, output: told.append(output)
-    )
+    monkeypatch.setattr(Vanilla3DGS, "prepare_stage2", lambda self, model, out: told.append(out))
     options = RunOptions(None, "auto", Settings(3), from_iter, device="cpu")
     if from_iter is not None:
         options = replace(options, stage="finetune")
@@ -220,9 +218,7 @@ def checkpoint(photographs, tmp_path_factory):
     ("stage", "from_iter", "learned"),
     [("joint", None, 1), ("joint", 3, 7), ("joint", 15, 4), ("finetune", 15, 4)],
 )
-def test_a_resumed_run_learns_from_one(
-    photographs, tmp_path, checkpoint, stage, from_iter, learned
-):
+def test_resumed_it_learns_from_one(photographs, tmp_path, checkpoint, stage, from_iter, learned):
     """Of 13 to 20, in the last of which the host takes no step; densification ends at 18."""
     words = command(photographs, tmp_path / "out", 20, "--start_checkpoint", checkpoint)
     options = RunOptions(stage=stage, from_iter=from_iter, device="cpu")

@@ -43,9 +43,7 @@ def main() -> int:
 
 def one_of(file: Path) -> str:
     """The first mutant of a module's first function, by mutmut's name for it."""
-    functions = (
-        each for each in ast.parse(file.read_text()).body if isinstance(each, ast.FunctionDef)
-    )
+    functions = (x for x in ast.parse(file.read_text()).body if isinstance(x, ast.FunctionDef))
     name = next(each.name for each in functions if not each.decorator_list)
     return f"{'.'.join(file.with_suffix('').parts)}.x_{name}__mutmut_1"
 

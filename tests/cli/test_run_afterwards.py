@@ -88,9 +88,7 @@ def test_it_trains_as_it_is_and_its_model_learns_after(host, photographs, tmp_pa
     assert json.loads(again.stdout)["control"] == json.loads(zero.stdout)["after"]
 
 
-def test_a_model_unlike_its_photographs_learns_from_its_pictures(
-    host, photographs, tmp_path, trained
-):
+def test_a_model_unlike_its_photographs_learns_from_itself(host, photographs, tmp_path, trained):
     words = host(photographs, shown="water * ")
     cameras = tmp_path / "out/cameras.json"
     cameras.parent.mkdir()

@@ -90,9 +90,7 @@ def test_a_transforms_file_gives_every_number(tmp_path):
         torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
     )
     torch.testing.assert_close(camera.rotation, flipped.T)
-    torch.testing.assert_close(
-        camera.translation, -flipped.T @ torch.tensor(PLACE, dtype=torch.float64)
-    )
+    torch.testing.assert_close(camera.translation, -flipped.T @ torch.tensor(PLACE).double())
 
 
 def test_what_a_transforms_file_leaves_out_is_square_centred_and_of_the_image(tmp_path):
@@ -158,9 +156,7 @@ def test_a_blender_scene_is_its_two_files(tmp_path):
 HALF = math.sqrt(0.5)  # a quarter turn about z, as a quaternion w, x, y, z
 
 
-@pytest.mark.parametrize(
-    "quaternion", [(0.5, 0.5, 0.5, 0.5), (0.1, 0.2, 0.3, 0.4), (-3.0, 1.0, 2.0, -1.0)]
-)
+@pytest.mark.parametrize("quaternion", [(0.5,) * 4, (0.1, 0.2, 0.3, 0.4), (-3.0, 1.0, 2.0, -1.0)])
 def test_a_quaternion_of_any_length_turns_as_the_oracle_has_it(quaternion):
     q = torch.tensor([quaternion], dtype=torch.float64)
     expected = rotation_matrices(torch.nn.functional.normalize(q))[0]

@@ -1031,9 +1031,7 @@ def test_what_a_script_does_to_gradients_changes_no_values(tmp_path, what):
 def test_what_a_densification_returns_may_be_read_where_it_ends_before_stage_2(tmp_path):
     repo = fork(tmp_path, (STATEMENT, f"pruned = {STATEMENT}"))
     assert errors(repo) == []
-    (held,) = (
-        each for each in ForkAdapter().seams_for(repo) if each.attribute.endswith("thin_out")
-    )
+    (held,) = (x for x in ForkAdapter().seams_for(repo) if x.attribute.endswith("thin_out"))
     with pytest.raises(EngineError, match="thin_out, whose result the host reads"):
         held.how(SimpleNamespace(seam=held))
 

@@ -124,9 +124,7 @@ def test_a_step_that_does_not_learn_truncates_and_leaves_no_gradient_for_the_nex
 
 def test_a_warm_up_draws_without_thresholds_and_counts_what_came_in():
     told = []
-    it = stage(
-        settings=Settings(iterations=2001, train="all", goal=Pressure(1e-2)), watch=told.append
-    )
+    it = stage(settings=Settings(2001, train="all", goal=Pressure(1e-2)), watch=told.append)
     whole(it)
     assert not it.viewed
     step(it, "a")

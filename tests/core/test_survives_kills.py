@@ -91,10 +91,7 @@ def dies_before_change(number: int, work: Callable[[], None]) -> None:
 
 @pytest.mark.parametrize(
     ("old", "new"),
-    [
-        *(("nothing", "pair"), ("pair", "pair"), ("pair", "alone"), ("alone", "pair")),
-        ("one", "one"),
-    ],
+    [("nothing", "pair"), ("pair", "pair"), ("pair", "alone"), ("alone", "pair"), ("one", "one")],
 )
 def test_after_a_death_at_any_change_the_old_pair_or_the_new_one_is_there(tmp_path, old, new):
     path, number, seen = tmp_path / "a.ply", 0, []

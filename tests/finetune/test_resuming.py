@@ -72,9 +72,7 @@ def warming_up(patch):
         *("warm-up", "target time"),
     ],
 )
-def test_cut_off_often_it_ends_as_never_cut(
-    model, dataset, tmp_path, monkeypatch, settings, prepare
-):
+def test_cut_off_it_ends_as_never_cut(model, dataset, tmp_path, monkeypatch, settings, prepare):
     if prepare:
         prepare(monkeypatch)
     path, told = tmp_path / "out.fragprune-unfinished", []
