@@ -54,20 +54,16 @@ def started(photographs, caplog):
     return start
 
 
-def test_what_is_taken_is_said_in_one_line(once, out, started):
-    line = started(out, 10)
-    assert line == (
-        f"stage 2: 6 iterations from iteration 10, {out / 'chkpnt10.pth'}: the last file "
-        "that the host's own training wrote; newer files of stage 2 ignored: 1"
-    )
-
-
-def test_results_do_not_compound_run_after_run(out, started):
+def test_results_do_not_compound_run_after_run_which_says_what_it_takes(out, started):
     first = (out / ply(17)).read_bytes()
-    for _ in range(2):
-        started(out, 10)
+    for newer, more in ((1, ("--checkpoint_iterations", 13)), (2, ())):
+        assert started(out, 10, *more) == (
+            f"stage 2: 6 iterations from iteration 10, {out / 'chkpnt10.pth'}: the last file "
+            f"that the host's own training wrote; newer files of stage 2 ignored: {newer}"
+        )
         assert (out / ply(17)).read_bytes() == first
         assert not (out / ply(24)).exists()
+    assert (out / "chkpnt13.pth").exists()
 
 
 def test_after_a_control_stage_two_starts_where_the_control_did(out, started):
@@ -82,12 +78,6 @@ def test_what_a_control_wrote_is_no_starting_point_in_its_own_folder(photographs
     assert (out / "control" / "chkpnt13.pth").exists()
     with pytest.raises(UsageError, match="only results of stage 2 or of a control"):
         run(command(photographs, out / "control", 10), FINETUNE)
-
-
-def test_checkpoints_of_stage_two_are_no_starting_points(out, started):
-    started(out, 10, "--checkpoint_iterations", 13)
-    assert (out / "chkpnt13.pth").exists()
-    assert f"iteration 10, {out / 'chkpnt10.pth'}:" in started(out, 10)
 
 
 def test_training_again_for_less_in_one_folder_is_what_counts(photographs, out, started, caplog):

@@ -25,12 +25,17 @@ def output(data, model, tmp_path):
     return tiny.host_output(tmp_path / "out", data, model)
 
 
-def test_profile_takes_the_newest_model_and_the_trainings_photographs(output, tmp_path):
+def test_commands_take_the_newest_model_and_the_trainings_cameras(output, tmp_path):
     result = run("profile", output)
     assert result.exit_code == 0
     assert "iteration_10000" in result.stderr
     assert f"Photographs: {tmp_path / 'data'}" in result.stderr
     assert run_json("profile", output)["views"] == 2
+    assert run_json("compare", *sorted(output.glob("*/*/point_cloud.ply")))["psnr_change"] == 0
+    pictures = run_json("render", output, "--out", tmp_path / "pictures")["files"]
+    assert len(pictures) == 9
+    with Image.open(pictures[0]) as picture:
+        assert picture.size == (tiny.SIDE, tiny.SIDE)
 
 
 def test_a_folder_with_one_output_folder_is_that(output, tmp_path):
@@ -133,25 +138,6 @@ def test_beside_data_the_training_says_whether_it_drew_over_white(data, model, t
         assert figures["psnr"] == expected["psnr"]
     (known / "cfg_args").write_text("not to be read")
     assert run_json("profile", known, "--data", data)["views"] == 2
-
-
-def test_render_takes_the_trainings_cameras(output, tmp_path):
-    report = run_json("render", output, "--out", tmp_path / "pictures")
-    assert len(report["files"]) == 9
-    with Image.open(report["files"][0]) as picture:
-        assert picture.size == (tiny.SIDE, tiny.SIDE)
-
-
-def test_finetune_learns_from_the_trainings_photographs(output, tmp_path):
-    out = tmp_path / "pruned.ply"
-    report = run_json("finetune", output, "--out", out, "--iters", 3, "--train", "opacity")
-    assert out.exists()
-    assert report["before"]["views"] == 2
-
-
-def test_compare_takes_the_trainings_photographs(output):
-    models = sorted(output.glob("point_cloud/*/point_cloud.ply"))
-    assert run_json("compare", *models)["psnr_change"] == 0
 
 
 def test_a_model_elsewhere_needs_data(path):

@@ -139,15 +139,6 @@ def test_what_a_host_makes_of_its_model_in_a_folder_below_is_not_taken(host, pho
     assert data["model_before"] == str(tmp_path / "out/point_cloud/iteration_9/point_cloud.ply")
 
 
-def test_a_model_in_another_folder_may_be_anothers(host, photographs, tmp_path, monkeypatch):
-    words = host(photographs)
-    script = words[2]
-    script.write_text(script.read_text().replace("sys.argv[2], sys.argv[4]", "sys.argv[2], 'own'"))
-    monkeypatch.chdir(tmp_path)
-    fails("run", *WORDS, *words, says=("no point_cloud.ply in", "fragprune finetune"), code=1)
-    assert not list(tmp_path.rglob("pruned.ply"))
-
-
 def test_a_script_in_a_folder_of_its_codebase_is_served(host, photographs, tmp_path):
     words = host(photographs)
     script = words[2]
@@ -161,24 +152,22 @@ def test_a_script_in_a_folder_of_its_codebase_is_served(host, photographs, tmp_p
     assert result.exit_code == 0, result.stderr
 
 
-def test_its_record_and_page_are_of_run(host, photographs, tmp_path):
+def test_its_record_and_page_are_of_run_and_it_is_said_who_learned(
+    host, photographs, tmp_path, caplog
+):
+    caplog.set_level("INFO", logger="fragprune")
     words, out = host(photographs), tmp_path / "out"
     said = run("run", *WORDS, *words).stdout
     assert f"fragprune report {out} " in said
+    assert "to see, add --stage finetune --control to the same command" in said
+    assert "no adapter fits (3dgs-fork does not fit" in caplog.text
+    assert "learns by vanilla 3DGS's drawing and loss" in caplog.text
+    assert "fragprune finetune" in caplog.text
     assert beside(out / "point_cloud/iteration_9/pruned.ply").command == "run"
     page = run_json("report", out)
     assert page["command"] == "run"
     assert "to see, add --stage finetune --control to the same command." in page["result"]
     assert "was finished before" in run("run", *WORDS, "--stage", "finetune", *words).stdout
-
-
-def test_it_is_said_who_learned(host, photographs, caplog):
-    caplog.set_level("INFO", logger="fragprune")
-    result = run("run", *WORDS, *host(photographs))
-    assert "to see, add --stage finetune --control to the same command" in result.stdout
-    assert "no adapter fits (3dgs-fork does not fit" in caplog.text
-    assert "learns by vanilla 3DGS's drawing and loss" in caplog.text
-    assert "fragprune finetune" in caplog.text
 
 
 def test_a_training_that_fails_is_followed_by_nothing(host, photographs, tmp_path):
@@ -219,47 +208,54 @@ def hear_ctrl_c():
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def test_a_model_of_an_earlier_training_is_not_taken_for_this_ones(host, photographs, tmp_path):
-    words = host(photographs)
-    script = words[2]
-    script.write_text(script.read_text().replace("shutil.copy(", "print("))
-    old = tmp_path / "out/point_cloud/iteration_8/point_cloud.ply"
-    old.parent.mkdir(parents=True)
-    shutil.copy(script, old)
-    os.utime(old, (1, 1))
-    fails("run", *WORDS, *words, says="no point_cloud.ply in", code=1)
-
-
-@pytest.mark.parametrize(
-    "more",
-    [("--stage", "joint"), ("--stage", "off"), ("--adapter", "3dgs-fork")],
-    ids=["joint", "off", "an adapter that was named"],
-)
-def test_what_only_an_adapter_can_do_is_refused(more, host, photographs, tmp_path):
-    fails("run", *WORDS, *more, *host(photographs), says="no adapter fits", code=1)
-    assert not (tmp_path / "out").exists()
-
-
-def test_several_processes_are_refused_before_it_trains(host, photographs, tmp_path, monkeypatch):
-    monkeypatch.setenv("WORLD_SIZE", "2")
-    fails("run", *WORDS, *host(photographs), says="several processes")
-    assert not (tmp_path / "out").exists()
-
-
-def test_photographs_that_we_cannot_read_are_said_before_the_training(host, tmp_path):
-    fails("run", *WORDS, *host(tmp_path / "nothing"), says="[dataset]", code=1)
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_script_that_trains_another_model_than_read_is_not_run(host, photographs, tmp_path):
-    words = host(photographs)
-    text = words[2].read_text()
-    words[2].write_text(f"{text}\nfrom scene.flat import FlatGaussianModel\n")
-    fails("run", *WORDS, *words, says="no adapter fits", code=1)
-    assert not (tmp_path / "out").exists()
-
-
 def test_a_fork_whose_ply_is_not_plain_is_not_trained(fork, photographs, tmp_path):
     root = fork(("return self._xyz", "return self._xyz + self.moved")).root
     command = ["--", root / "train.py", "-s", photographs, "-m", tmp_path / "out"]
     fails("run", *WORDS, *command, says="no adapter fits", code=1)
+
+
+OTHER_MODEL = "\nfrom scene.flat import FlatGaussianModel\n"
+NO_ADAPTER = "no adapter fits"
+
+
+@pytest.mark.parametrize(
+    ("more", "scene", "script", "processes", "says"),
+    [
+        *((("--stage", stage), "", "", "1", NO_ADAPTER) for stage in ("joint", "off")),
+        (("--adapter", "3dgs-fork"), "", "", "1", NO_ADAPTER),
+        ((), "", OTHER_MODEL, "1", NO_ADAPTER),
+        ((), "nothing", "", "1", "[dataset]"),
+        ((), "", "", "2", "several processes"),
+    ],
+    ids=["joint", "off", "an adapter", "another model", "photographs", "processes"],
+)
+def test_what_cannot_be_done_is_refused_before_the_training(
+    host, photographs, tmp_path, monkeypatch, more, scene, script, processes, says
+):
+    monkeypatch.setenv("WORLD_SIZE", processes)
+    words = host(photographs / scene)
+    with words[2].open("a") as file:
+        file.write(script)
+    code = 2 if processes == "2" else 1
+    fails("run", *WORDS, *more, *words, says=says, code=code)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [("shutil.copy(", "print("), ("sys.argv[2], sys.argv[4]", "sys.argv[2], 'own'")],
+    ids=["none", "in another folder"],
+)
+def test_a_training_that_leaves_no_model_where_it_was_told_is_named(
+    host, photographs, tmp_path, monkeypatch, old, new
+):
+    """A model of an earlier training is there, which is not taken for this one's."""
+    words = host(photographs)
+    words[2].write_text(words[2].read_text().replace(old, new))
+    monkeypatch.chdir(tmp_path)
+    earlier = tmp_path / "out/point_cloud/iteration_8/point_cloud.ply"
+    earlier.parent.mkdir(parents=True)
+    shutil.copy(words[2], earlier)
+    os.utime(earlier, (1, 1))
+    fails("run", *WORDS, *words, says=("no point_cloud.ply in", "fragprune finetune"), code=1)
+    assert not list(tmp_path.rglob("pruned.ply"))
