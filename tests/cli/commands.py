@@ -12,9 +12,9 @@ def run(*arguments: object) -> Result:
     return CliRunner().invoke(cli, [str(a) for a in arguments], catch_exceptions=False)
 
 
-def run_json(*arguments: object) -> dict:
+def run_json(command: str, *arguments: object) -> dict:
     """The one JSON object on stdout of a command that succeeds."""
-    result = run(*arguments, "--json")
+    result = run(command, "--json", *arguments)
     assert result.exit_code == 0, result.stderr
     return json.loads(result.stdout)
 

@@ -192,17 +192,6 @@ def test_words_that_make_no_sense_are_usage(words, says, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_failed_write_touches_nothing(data, path, out, monkeypatch):
-
-    def full(*args, **kwargs):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("plyfile.PlyData.write", full)
-    arguments = ("finetune", path, "--data", data, "--out", out, "--iters", 2)
-    fails(*arguments, says="No space left", code=1)
-    assert untouched(out)
-
-
 @pytest.mark.parametrize(
     ("words", "where", "found"),
     [

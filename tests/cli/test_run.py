@@ -29,13 +29,6 @@ def scene(photographs):
     return photographs
 
 
-def ran(*words):
-    """The one JSON object of a run that succeeds; --json is ours only before the command."""
-    result = run("run", "--json", *words)
-    assert result.exit_code == 0, result.stderr
-    return json.loads(result.stdout)
-
-
 def command(scene, out, *more):
     words = ["-s", scene, "-m", out, "--iterations", 10, *TINY, *more]
     return ["--", HOST / "train.py", *words]
@@ -45,7 +38,7 @@ def command(scene, out, *more):
 def trained(scene, tmp_path_factory):
     """A run with half the sides asked for, and what it printed."""
     out = tmp_path_factory.mktemp("trained") / "out"
-    return out, ran(*WORDS, *command(scene, out, "-r", 2)), scene
+    return out, run_json("run", *WORDS, *command(scene, out, "-r", 2)), scene
 
 
 @pytest.fixture
@@ -115,7 +108,7 @@ def test_a_control_inside_one_training_lies_beside_the_result_too(scene, tmp_pat
     out = tmp_path / "out"
     words = ["--device", "cpu", *learning]
     training = command(scene, out, "--iterations", 16)
-    ran(*words, *training)
+    run_json("run", *words, *training)
     kept = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
     zero = run("run", *words, "--control", *training)
     assert f"Model: {out / 'control'}" in zero.stdout
@@ -144,10 +137,10 @@ def test_a_control_lies_beside_the_result_and_is_quoted_with_it(folder):
     assert ">pruned<" not in page
     assert {path: path.read_bytes() for path in kept} == kept
     assert "pruning itself makes" in run("run", *finetune, *words).stdout
-    again = ran(*finetune, "--again", *words)
+    again = run_json("run", *finetune, "--again", *words)
     assert again["control"] == records.find(out / "control")[0].data["after"]
     assert "pruning itself makes" in run_json("report", out)["result"]
-    other = ran(*finetune, "--again", *words, "--lambda_dssim", 0.5)
+    other = run_json("run", *finetune, "--again", *words, "--lambda_dssim", 0.5)
     assert other["control"] is None  # of another loss
 
 
@@ -168,7 +161,7 @@ def test_views_that_stage_one_saw_are_not_said_to_be_held_out(scene, tmp_path, h
     out = tmp_path / "out"
     words = command(scene, out, "--densify_until_iter", 8)
     first = [word for word in words if held or word != "--eval"]
-    ran("--stage", "off", *WORDS, *first)
+    run_json("run", "--stage", "off", *WORDS, *first)
     line = run("run", "--stage", "finetune", *WORDS, *words).stdout
     assert (" held out" in line) == held
     assert ("that its training had seen" in line) != held
@@ -185,7 +178,7 @@ def test_where_the_code_leaves_it_open_the_model_says_which_principal_point_it_h
     with (shutil.copytree(HOST, host) / "scene" / "cameras.py").open("a") as source:
         source.write("\n\ndef own(c):\n    getProjectionMatrix(1, 9, c.FoVx, c.FoVy, cx=c.cx)\n")
     words = [host / "train.py", *command(scene, tmp_path / "out")[2:]]
-    assert ran(*WORDS, "--", *words)["after"]
+    assert run_json("run", *WORDS, "--", *words)["after"]
     assert records.recorded(records.find(tmp_path / "out")[-1]).photographs.centred
 
 
@@ -193,7 +186,7 @@ def test_a_finished_stage_two_says_so_and_runs_nothing(folder):
     (out, words), finetune = folder, ["--stage", "finetune", *WORDS]
     result = models(out)[1]
     written = result.stat().st_mtime_ns
-    report = ran(*finetune, *words)
+    report = run_json("run", *finetune, *words)
     assert report["already_finished"] is True
     assert (report["iterations"], report["model_after"]) == (0, str(result))
     text = run("run", *finetune, *words)
@@ -201,7 +194,7 @@ def test_a_finished_stage_two_says_so_and_runs_nothing(folder):
     assert "is finished" in text.stdout
     assert f"fragprune compare {models(out)[0]} {result}" in text.stdout
     assert result.stat().st_mtime_ns == written
-    assert ran(*finetune, "--pressure", 2e-3, *words)["already_finished"] is False
+    assert run_json("run", *finetune, "--pressure", 2e-3, *words)["already_finished"] is False
 
 
 def test_a_model_that_knows_photographs_by_heart_is_told(scene, tmp_path, monkeypatch):
@@ -218,7 +211,7 @@ def test_a_model_that_knows_photographs_by_heart_is_told(scene, tmp_path, monkey
     (record,) = records.find(out)
     assert (record.data["keep"], record.data["forgotten"]) == (trial.KEEP, trial.BY_HEART)
     assert record.data["settings"]["dropout"] == trial.DROPOUT
-    asked = ran("--stage", "finetune", "--dropout", 0, *WORDS, *words)
+    asked = run_json("run", "--stage", "finetune", "--dropout", 0, *WORDS, *words)
     assert (asked["gaussians"], asked["keep"], asked["forgotten"]) == (whole, None, None)
 
 
@@ -252,7 +245,7 @@ def test_where_a_gpu_has_no_room_to_measure_the_rest_is_reported(scene, tmp_path
         raise FULL
 
     monkeypatch.setattr(work, "measure_all", fail)
-    report = ran(*WORDS, *command(scene, tmp_path / "out"))
+    report = run_json("run", *WORDS, *command(scene, tmp_path / "out"))
     assert (report["iterations"], report["after"]) == (6, None)
     assert "Tried to allocate 2.00 GiB" in report["not_compared"]["found"]
     assert records.find(tmp_path / "out")
@@ -311,12 +304,12 @@ def test_two_models_of_nobody_need_their_photographs_named(tmp_path):
 def test_joint_learning_is_measured_and_compared_with_another_training(scene, tmp_path):
     out, plain = tmp_path / "out", tmp_path / "plain"
     words = ["--iterations", 24, "--densify_until_iter", 12]
-    text = ran("--device", "cpu", "--stage", "joint", *command(scene, out, *words))
+    text = run_json("run", "--device", "cpu", "--stage", "joint", *command(scene, out, *words))
     measured = text["after"]
     assert text["before"] is None
     assert measured["psnr"] > 0
     assert text["not_compared"] is None
-    ran("--device", "cpu", "--stage", "off", *command(scene, plain, *words))
+    run_json("run", "--device", "cpu", "--stage", "off", *command(scene, plain, *words))
     last = "point_cloud/iteration_24/point_cloud.ply"
     same = run_json("compare", plain / last, out / last)
     assert same["b"]["psnr"] == pytest.approx(measured["psnr"], rel=1e-6)

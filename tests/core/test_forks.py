@@ -5,17 +5,17 @@ from functools import partial
 from types import SimpleNamespace
 
 import pytest
+from core.test_verdict import judged
 from miniatures.forks import RENDER, fork
 
 from fragprune_3dgs_fork import ForkAdapter, Unread
 from fragprune_3dgs_fork.fork import read_fork
 from fragprune_graphdeco import plain
 from fragprune_plugins.adapting import EngineError, HostCall, NotComparedError, Role, UsageError
-from fragprune_plugins.hosts.choosing import attempt, choose
+from fragprune_plugins.hosts.choosing import choose
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.plugins.loading import load_plugins
-from fragprune_plugins.workbench.check.work import judge
 
 
 def errors(repo):
@@ -68,10 +68,8 @@ SERVED = {
 def test_a_plain_fork_fits_and_is_to_be_proved(tmp_path, what):
     repo = fork(tmp_path, **SERVED[what])
     assert errors(repo) == []
-    plugins = load_plugins()
-    adapters = plugins.adapters
-    assert choose(repo, adapters).name == "3dgs-fork"
-    verdict = judge(repo, attempt(repo, adapters), adapters, plugins)
+    assert choose(repo, load_plugins().adapters).name == "3dgs-fork"
+    verdict = judged(repo)
     assert verdict.kind == "fits"
     assert "Not proved" in verdict.sentence
 
@@ -118,9 +116,7 @@ def test_gaussians_in_another_order_are_another_picture_of_a_plain_ply(tmp_path)
     assert errors(fork(tmp_path / "z", kernel="depths[idx] = p_view.z;")) == []
     repo = fork(tmp_path / "distance", kernel="depths[idx] = sqrt(norm(p_view));")
     assert "Gaussians sorted by sqrt(norm(p_view))" in errors(repo)[0]
-    plugins = load_plugins()
-    verdict = judge(repo, attempt(repo, plugins.adapters), plugins.adapters, plugins)
-    assert verdict.kind == "finetune"
+    assert judged(repo).kind == "finetune"
 
 
 ONE_PASS = {

@@ -6,7 +6,7 @@ from finetune import tiny
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from fragprune_plugins.errors import DivergedError, OutputError, SidecarError
+from fragprune_plugins.errors import DivergedError, SidecarError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.workbench.models.formats.ply import write_ply
@@ -137,20 +137,6 @@ def test_metadata_that_are_none_are_refused(model, trained, key, value):
     parts({key: value})(sidecar.save(model, trained))
     with pytest.raises(SidecarError, match="at its metadata"):
         sidecar.load(model, 6)
-
-
-def test_a_place_that_cannot_be_written_is_stated_and_the_old_stays(model, trained, monkeypatch):
-    path = sidecar.save(model, trained)
-    before = path.read_bytes()
-
-    def full(*_, **__):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(sidecar, "save_file", full)
-    with pytest.raises(OutputError, match="No space left"):
-        sidecar.save(model, ThresholdStore(6))
-    assert path.read_bytes() == before
-    assert sorted(p.name for p in model.parent.iterdir()) == [path.name, model.name]
 
 
 def test_what_is_not_finite_is_not_written_and_the_old_sidecar_stays(model, trained):

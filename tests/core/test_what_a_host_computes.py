@@ -268,22 +268,21 @@ def test_a_drawing_function_of_a_host_returns_its_picture_as_render(tmp_path):
     assert "returns no render" in errors(HostRepo(tmp_path))[0]
 
 
-def test_a_function_beside_the_argument_groups_may_read_the_flags(tmp_path):
-    repo = skeleton(tmp_path)
-    repo = rewritten(repo, "train.py", "parser.parse_args(", "merged_args(parser, ")
-    assert any("no argparse" in error for error in errors(repo))
-    groups = tmp_path / "arguments/__init__.py"
-    reads = "def merged_args(parser, line):\n    return parser.parse_args(line)\n"
-    groups.write_text(groups.read_text() + reads)
-    assert not errors(HostRepo(tmp_path))
-
-
-def test_argument_groups_make_flags_of_their_attributes(tmp_path):
-    repo = skeleton(tmp_path)
-    repo = rewritten(repo, "train.py", '"--model_path", ', "")
-    assert any("no --model_path" in error for error in errors(repo))  # iterations is a group's
-    groups = tmp_path / "arguments/__init__.py"
-    groups.write_text(groups.read_text() + "        self._model_path = ''\n")
+@pytest.mark.parametrize(
+    ("old", "new", "says", "more"),
+    [
+        (
+            *("parser.parse_args(", "merged_args(parser, ", "no argparse"),
+            "def merged_args(parser, line):\n    return parser.parse_args(line)\n",
+        ),
+        ('"--model_path", ', "", "no --model_path", "        self._model_path = ''\n"),
+    ],
+)
+def test_a_module_of_argument_groups_may_read_flags_and_makes_some(tmp_path, old, new, says, more):
+    repo = rewritten(skeleton(tmp_path), "train.py", old, new)
+    assert any(says in error for error in errors(repo))
+    with (tmp_path / "arguments/__init__.py").open("a") as groups:
+        groups.write(more)
     assert not errors(HostRepo(tmp_path))
 
 

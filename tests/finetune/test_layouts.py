@@ -38,15 +38,22 @@ def test_nerfstudios_folder_holds_out_every_eighth_name(tmp_path, images):
     torch.testing.assert_close(data.train[2].view.viewmatrix, tiny.cameras()[3].view().viewmatrix)
 
 
-def test_nerfstudios_file_may_say_which_views_are_held_out(tmp_path, images):
+@pytest.mark.parametrize(
+    ("held", "train", "test"),
+    [
+        ({"val": [6], "test": [6, 7]}, NAMES[:5], NAMES[6:8]),
+        ({}, NAMES[1:5], NAMES[:1]),  # the rest is ours to hold out
+    ],
+)
+def test_nerfstudios_file_may_say_which_views_train_and_are_held_out(
+    tmp_path, images, held, train, test
+):
     listed = {
-        "train_filenames": [f"images/{name}.png" for name in NAMES[:5]],
-        "val_filenames": ["images/view06.png"],
-        "test_filenames": ["images/view06.png", "images/view07.png"],
+        f"{part}_filenames": [f"images/{NAMES[number]}.png" for number in numbers]
+        for part, numbers in ({"train": range(5)} | held).items()
     }
     data = load_dataset(write_nerfstudio(tmp_path, images, **listed))
-    assert sorted(stems(data.train)) == NAMES[:5]
-    assert sorted(stems(data.test)) == ["view06", "view07"]
+    assert (sorted(stems(data.train)), sorted(stems(data.test))) == (train, test)
 
 
 def test_nerfstudios_file_goes_before_its_colmap_model(tmp_path, images):
@@ -230,13 +237,6 @@ def test_images_of_one_name_in_two_folders_are_two_images(tmp_path, images):
     data = load_dataset(tmp_path)
     assert [str(shot.path.relative_to(tmp_path)) for shot in data.test] == names[:1]
     assert [str(shot.path.relative_to(tmp_path)) for shot in data.train] == names[2:]
-
-
-def test_a_file_may_say_which_views_train_and_leave_the_rest_to_us(tmp_path, images):
-    listed = {"train_filenames": [f"images/{name}.png" for name in NAMES[:5]]}
-    data = load_dataset(write_nerfstudio(tmp_path, images, **listed))
-    assert stems(data.test) == NAMES[:1]
-    assert stems(data.train) == NAMES[1:5]
 
 
 def test_a_mask_that_hides_everything_is_refused(colmap):

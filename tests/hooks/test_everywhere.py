@@ -8,7 +8,7 @@ from cli.commands import DRAWING, drawing, run, run_json
 from finetune import tiny
 
 import fragprune_plugins
-from fragprune_plugins import Pressure, RasterInputs, Schedule, Settings, ThresholdStore, finetune
+from fragprune_plugins import RasterInputs, Schedule, Settings, ThresholdStore, finetune
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.plugins.hookspecs import hookimpl
@@ -132,21 +132,6 @@ def test_finetune_learns_by_a_plugins_schedule(model, dataset, plug):
     assert result.model.thresholds is None
     given = finetune(model, dataset, settings, schedule=Schedule(settings)).model  # which wins
     assert torch.equal(given.thresholds.logits, learned.model.thresholds.logits)
-
-
-def test_finetune_learns_opacities_under_a_plugins_thresholds(model, dataset, plug):
-    class Half:
-        @hookimpl
-        def fragprune_truncate(self, inputs, store):
-            return torch.full((len(store),), 0.5)
-
-    plug(Half())
-    result = finetune(model, dataset, Settings(iterations=5, goal=Pressure(1e-3)))
-    start = ThresholdStore(len(model))
-    start.open(torch.sigmoid(model.opacity))
-    assert torch.equal(result.model.thresholds.logits, start.logits)  # they decided nothing
-    assert not torch.equal(result.model.opacity, model.opacity)
-    assert result.progress.fragments_after < 0.8 * result.progress.fragments_before
 
 
 def test_thresholds_that_are_passed_win_over_a_plugins(model, plug):
