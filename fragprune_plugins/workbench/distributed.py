@@ -324,11 +324,6 @@ class Shards(Processes):
         return rows[start : start + self.counts[self.ranks.rank]]
 
 
-def processes_of(engine: Engine, ranks: Ranks, count: int) -> Processes:
-    """Shards if the engine is sharded, else copies; of ``count`` Gaussians in this process."""
-    return Shards(ranks, count) if isinstance(engine, ShardedEngine) else Processes(ranks)
-
-
 def part_of(model: Model, ranks: Ranks, device: torch.device | str) -> Model:
     """This process' share of a model's Gaussians, on a device: successive rows.
 

@@ -14,7 +14,7 @@ from fragprune_plugins.learning import schedule
 from fragprune_plugins.learning.goals import Control, Fewer, Portable, Pressure
 from fragprune_plugins.learning.interruption import sigterm_interrupts
 from fragprune_plugins.learning.schedule import Schedule, Settings
-from fragprune_plugins.workbench.finetune import resuming
+from fragprune_plugins.workbench.finetune import loop, resuming
 from fragprune_plugins.workbench.finetune.api import finetune
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
 from fragprune_plugins.workbench.goals import Faster
@@ -148,7 +148,7 @@ def test_another_configuration_is_refused_and_named(
     if named == "schedule":  # a caller's own
         options["schedule"] = Schedule(settings, warmup=6)
     elif named == "loss":  # other code gives other last bits
-        monkeypatch.setattr(resuming, "code_for", lambda _: "another")
+        monkeypatch.setattr(loop, "code_for", lambda _: "another")
     elif named == "model":
         model = truth
     elif named == "photographs":

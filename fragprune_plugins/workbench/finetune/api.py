@@ -12,12 +12,12 @@ from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.interruption import Terminate
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.plugins.hooks import engine_for, schedule_for
-from fragprune_plugins.workbench.distributed import processes_of
-from fragprune_plugins.workbench.finetune.faster import FrameTarget
+from fragprune_plugins.workbench.distributed import ShardedEngine, Shards
 from fragprune_plugins.workbench.finetune.loop import FinetuneResult, Training
-from fragprune_plugins.workbench.finetune.resuming import Checkpoints, Keeper
+from fragprune_plugins.workbench.finetune.processes import Processes
+from fragprune_plugins.workbench.finetune.resuming import Checkpoints
 from fragprune_plugins.workbench.finetune.searching import strongest
-from fragprune_plugins.workbench.goals import AtMost, Faster
+from fragprune_plugins.workbench.goals import AtMost
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.ranks import Ranks
 from fragprune_plugins.workbench.scenes.dataset import Dataset
@@ -78,9 +78,9 @@ def finetune(
     if isinstance(goal, AtMost):
         train = partial(finetune, model, dataset, engine=engine, progress=progress, ranks=ranks)
         return strongest(train, settings, dataset.test, engine=engine).result
-    processes = processes_of(engine, ranks, len(model))
+    sharded = isinstance(engine, ShardedEngine)
+    processes = Shards(ranks, len(model)) if sharded else Processes(ranks)
     processes.expect_able(settings)
-    target = FrameTarget(goal.ratio) if isinstance(goal, Faster) else None
     if goal.on_area and model.pruned:
         raise UsageError(
             "finetune",
@@ -88,23 +88,22 @@ def finetune(
             "a model without any: it is for viewers that ignore them",
             "Pass model.untruncated(), or --no-truncation on the command line.",
         )
-    training = Training(
-        model, dataset, settings, schedule or schedule_for(settings), engine, processes, target
-    )
-    return _learned(training, Keeper(checkpoints, training), progress and ranks.first)
+    schedule = schedule or schedule_for(settings)
+    training = Training(model, dataset, settings, schedule, engine, processes, checkpoints)
+    return _learned(training, progress and ranks.first)
 
 
-def _learned(training: Training, keeper: Keeper, progress: bool) -> FinetuneResult:
+def _learned(training: Training, progress: bool) -> FinetuneResult:
     """Learn to the end, or until a signal comes."""
     resumed, interrupted, terminated = training.done, False, False
     try:
-        training.learn(keeper, progress)
+        training.learn(progress)
     except KeyboardInterrupt as error:
         if training.processes.divided and not training.between:
             raise  # a second signal did not wait for the others, who hold the other parts
         interrupted, terminated = True, isinstance(error, Terminate)
         if training.between:
-            keeper.keep(training)
+            training.keep()
     training.stage.check()
     count = training.processes.total(len(training.start))
     progress_made = replace(training.stage.progress(), steps=training.done, gaussians=count)

@@ -5,30 +5,33 @@ from __future__ import annotations
 import random
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from functools import partial
 from itertools import islice
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
 from fragprune_plugins.engines import Engine
+from fragprune_plugins.errors import CheckpointError, SidecarError
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.adam import EPSILON, stepping_fused
 from fragprune_plugins.learning.area import area_per_pixel
 from fragprune_plugins.learning.deferred import DeferredSignals, between_steps
 from fragprune_plugins.learning.events import Progress, StepStats
 from fragprune_plugins.learning.schedule import Schedule, Settings
-from fragprune_plugins.learning.targets import Target
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.hooks import thresholds_for
 from fragprune_plugins.plugins.loading import installed
 from fragprune_plugins.types import RasterInputs, RasterOutputs, one_line
-from fragprune_plugins.workbench.finetune.losses import photometric_loss
+from fragprune_plugins.workbench.finetune.faster import FrameTarget
+from fragprune_plugins.workbench.finetune.losses import code_for, photometric_loss
 from fragprune_plugins.workbench.finetune.processes import Processes, SharedStage
+from fragprune_plugins.workbench.finetune.resuming import Checkpoints, configuration
+from fragprune_plugins.workbench.goals import Faster
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 
 # Learning rates at the start of stage 2, the hosts' own; all decay with the opacity's. Positions
@@ -37,6 +40,13 @@ from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 _APPEARANCE = {"f_dc": 0.0025, "f_rest": 0.0025 / 20}
 _GEOMETRY = {"xyz": 1.6e-5, "scaling": 0.005, "rotation": 0.001}
 _POSTFIXES = 100  # times in a run that the bar says how it goes
+
+_MOMENTS = ("exp_avg", "exp_avg_sq")
+_OF_VIEWS = {"before", "after"}  # of stage 2's tensors; all others have a row for each Gaussian
+_UNFIT = (  # raised where the parts of a checkpoint do not fit what they are loaded into
+    *(KeyError, ValueError, TypeError, IndexError, RuntimeError, AttributeError, OverflowError),
+    SidecarError,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,23 +79,13 @@ class FinetuneResult:
     __repr__ = one_line
 
 
-class Keeping(Protocol):
-    """Writes the checkpoints of a training."""
-
-    def due(self, step: int) -> bool:
-        """Whether it is time for one after a step."""
-
-    def keep(self, training: Training) -> None:
-        """Write one, between two steps."""
-
-
 class Training:
     """One fine-tuning under way.
 
     Args:
         start: the model as it comes in; not changed.
         dataset: on the model's device.
-        target: what thresholds are held to; that of the goal when None.
+        checkpoints: from which it goes on, if there is one, and where the next ones go.
 
     Attributes:
         model: as it is now; what trains has gradients.
@@ -104,14 +104,15 @@ class Training:
         schedule: Schedule,
         engine: Engine,
         processes: Processes,
-        target: Target | None = None,
+        checkpoints: Checkpoints | None = None,
     ) -> None:
         self.start, self.dataset, self.settings = start, dataset, settings
         self.engine, self.processes = engine, processes
         self.curves: list[StepStats] = []
         self.done, self.between = 0, True
         self.started = time.perf_counter()
-        known = start.thresholds if settings.goal.presses else None
+        goal = settings.goal
+        known = start.thresholds if goal.presses else None
         self.stage = SharedStage(
             ThresholdStore(len(start), start.device) if known is None else known.clone(),
             settings,
@@ -120,7 +121,7 @@ class Training:
             views={shot: partial(self._draw, shot) for shot in dataset.train},
             watch=self._watched,
             parameters=self.parameters,
-            target=target,
+            target=FrameTarget(goal.ratio) if isinstance(goal, Faster) else None,
             everywhere=processes.everywhere,
         )
         rates = {"opacity": settings.opacity_lr}
@@ -142,6 +143,83 @@ class Training:
         self._plain_first = False  # a view of this step is drawn for the first time somewhere
         if self.stage.target is not None:
             self.stage.target.attach(self)
+        self._checkpoints = checkpoints if processes.first else None  # which writes them
+        if checkpoints is not None or processes.ranks.several:
+            self._go_on(checkpoints)
+
+    def _go_on(self, checkpoints: Checkpoints | None) -> None:
+        """Take over what a checkpoint holds, if there is one, in all processes."""
+        processes, device = self.processes, self.start.device
+        given = self.start, self.dataset, self.settings, self.engine.name
+        asked = processes.described(configuration(*given, self.stage.schedule))
+        self._configuration = asked | {"loss": code_for(device)}
+        if checkpoints is not None:
+            where = "cpu" if processes.divided else device
+            tensors, values = checkpoints.load(self._configuration, where)
+            if values:
+                try:
+                    self._load_state_dict(tensors, values)
+                except _UNFIT as error:
+                    raise CheckpointError(
+                        str(checkpoints.path),
+                        f"parts that do not fit together ({error})",
+                        "what a fine-tuning wrote",
+                        "Begin anew with --again.",
+                    ) from error
+                checkpoints.tell_of(self.done, self.settings.iterations, values["threads"])
+        versions = {"checkpoint": self.done, "torch": torch.__version__}
+        processes.ranks.agree(self._configuration | versions, "fine-tuning, before its first step")
+
+    def keep(self) -> None:
+        """Write a checkpoint, between two steps; all processes, if each has a part of it."""
+        mine = self._checkpoints is not None or self.processes.divided
+        if not mine or not self.optimizer.state:  # no step was taken
+            return
+        self.stage.check()
+        tensors, values = self._state_dict()
+        if self._checkpoints is not None:
+            self._checkpoints.save(tensors, values | {"configuration": self._configuration})
+
+    def _state_dict(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Tensors and plain values, for ``_load_state_dict``; the first process has all rows."""
+        tensors, values = self.stage.state_dict()
+        for name, parameter in self.parameters().items():
+            tensors[f"model.{name}"] = parameter
+            moments = self.optimizer.state[parameter]
+            for moment in _MOMENTS:
+                tensors[f"{moment}.{name}"] = moments[moment]
+        for name in sorted(tensors.keys() - _OF_VIEWS):  # in the same order in all processes
+            tensors[name] = self.processes.whole(tensors[name])
+        points = [astuple(point) for point in self.curves]
+        tensors["curves"] = torch.tensor(points, dtype=torch.float64).reshape(len(points), -1)
+        return tensors, values | {
+            "done": self.done,
+            "adam_step": float(moments["step"]),
+            "seconds": self.seconds,
+            "threads": torch.get_num_threads(),
+        }
+
+    def _load_state_dict(self, tensors: dict[str, Tensor], values: dict[str, Any]) -> None:
+        """Take over what ``_state_dict`` gave; raises one of ``_UNFIT`` if it does not fit."""
+        stage = self.stage
+        for name in tensors.keys() - _OF_VIEWS - {"curves"}:
+            tensors[name] = self.processes.own(tensors[name])
+        stage.load_state_dict(tensors, values)
+        if len(stage.store) != len(self.model):
+            raise ValueError(f"{len(stage.store)} thresholds of {len(self.model)} Gaussians")
+        for name, parameter in self.parameters().items():
+            parameter.data.copy_(tensors[f"model.{name}"])
+            step = torch.tensor(float(values["adam_step"]), dtype=torch.float32)
+            moments = {
+                moment: torch.empty_like(parameter).copy_(tensors[f"{moment}.{name}"])
+                for moment in _MOMENTS
+            }
+            self.optimizer.state[parameter] = {"step": step, **moments}
+        self.curves += [StepStats(int(step), *row) for step, *row in tensors["curves"].tolist()]
+        self.done = int(values["done"])
+        if not 0 <= self.done == stage.steps <= self.settings.iterations:
+            raise ValueError(f"{self.done} steps, of which the thresholds took {stage.steps}")
+        self.started -= values["seconds"]
 
     def parameters(self) -> dict[str, Tensor]:
         """What trains beside the thresholds, by name."""
@@ -162,8 +240,8 @@ class Training:
         """Wall-clock seconds of all steps, also of those before a checkpoint."""
         return time.perf_counter() - self.started
 
-    def learn(self, keeper: Keeping, progress: bool) -> None:
-        """All steps that are not done yet."""
+    def learn(self, progress: bool) -> None:
+        """All steps that are not done yet; with ``progress`` there is a bar on stderr."""
         settings, total = self.settings, self.settings.iterations
         steps = order(self.dataset.train, total, settings.views_per_step, settings.seed)
         bar = tqdm(
@@ -172,12 +250,12 @@ class Training:
         with bar, stepping_fused(), between_steps() as waiting:
             for shots in islice(steps, self.done, None):
                 self.between = False
-                self._step(shots, waiting, keeper)
+                self._step(shots, waiting)
                 self.between = True
                 if self.processes.may_end:
                     waiting()
-                if self.processes.keeps(keeper.due(self.done)):
-                    keeper.keep(self)
+                if self.processes.keeps(self._due(self.done)):
+                    self.keep()
                 bar.update()
                 if self.curves and self.done % max(1, total // _POSTFIXES) == 0:
                     warming = self.stage.warming_up
@@ -206,7 +284,11 @@ class Training:
         """All that learns, by name."""
         return {**self.parameters(), "thresholds": self.stage.store.logits}
 
-    def _step(self, shots: Sequence[Shot], waiting: DeferredSignals, keeper: Keeping) -> None:
+    def _due(self, step: int) -> bool:
+        """Whether it is time for a checkpoint after a step, by this process."""
+        return self._checkpoints is not None and self._checkpoints.due(step)
+
+    def _step(self, shots: Sequence[Shot], waiting: DeferredSignals) -> None:
         stage = self.stage
         stage.begin(lambda: torch.sigmoid(self.model.opacity.detach()))
         self._plain_first = not all(map(stage.knows, shots))
@@ -217,7 +299,7 @@ class Training:
             stage.on_loss(loss)
             torch.autograd.backward(loss if pressure is None else loss + pressure)
         stage.picture = ", ".join(shot.name for shot in shots)
-        due = keeper.due(self.done + 1)
+        due = self._due(self.done + 1)
         self.processes.went_backward(stage, self._learned(), shots, waiting, due=due)
         rates = self.rates.items()
         for group, (name, base) in zip(self.optimizer.param_groups, rates, strict=True):

@@ -7,7 +7,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import astuple, dataclass, field
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -18,19 +18,16 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from fragprune_plugins.constants import VERSION
-from fragprune_plugins.errors import CheckpointError, OutputError, SidecarError
+from fragprune_plugins.errors import CheckpointError, OutputError
 from fragprune_plugins.files.atomic import digest, replacing
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.reading import UntrustedFile, parse_json
-from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.learning.finite import expect_finite, not_finite
 from fragprune_plugins.learning.plain import numbers_of
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.hooks import schedule_for
 from fragprune_plugins.plugins.loading import installed
-from fragprune_plugins.workbench.finetune.loop import Training
-from fragprune_plugins.workbench.finetune.losses import code_for
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Photograph, Shot
 from fragprune_plugins.workbench.scenes.images import IMAGE_FILE
 
@@ -40,12 +37,6 @@ EVERY = 300.0
 """Seconds between two checkpoints."""
 
 _DECIDING = (hookspecs.fragprune_truncate, hookspecs.fragprune_create_schedule)
-_MOMENTS = ("exp_avg", "exp_avg_sq")
-_OF_VIEWS = {"before", "after"}  # of stage 2's tensors; all others have a row for each Gaussian
-_UNFIT = (  # raised where the parts of a checkpoint do not fit what they are loaded into
-    *(KeyError, ValueError, TypeError, IndexError, RuntimeError, AttributeError, OverflowError),
-    SidecarError,
-)
 _FILE = UntrustedFile(
     CheckpointError,
     "unreadable",
@@ -119,7 +110,7 @@ class Checkpoints:
             return {}, {}
         tensors, values = read(self.path, device)
         found = values.get("configuration", {})
-        if differ := differences(found, asked):
+        if differ := [key for key in sorted(found | asked) if found.get(key) != asked.get(key)]:
             other = [name for name in differ if name != "schedule"] or differ  # settings make it
             raise CheckpointError(
                 str(self.path),
@@ -128,6 +119,15 @@ class Checkpoints:
                 "Repeat the command that was interrupted to finish it, or begin anew with --again.",
             )
         return tensors, values
+
+    def tell_of(self, done: int, total: int, threads: int) -> None:
+        """Say from which step the fine-tuning goes on, and whether bits may differ."""
+        self.tell(f"resuming at step {done} of {total}, from {self.path}")
+        if threads != (now := torch.get_num_threads()):
+            self.tell(
+                f"it was begun on {threads} threads, and goes on on {now}: the last bits of the "
+                "result may differ"
+            )
 
     def clear(self) -> None:
         """Remove the file: the result is saved."""
@@ -145,105 +145,6 @@ def read(path: Path, device: torch.device | str) -> tuple[dict[str, Tensor], dic
         if wrong := not_finite({k: each for k, each in tensors.items() if k != "curves"}):
             raise ValueError(f"NaN or infinity in {', '.join(wrong)}")
         return tensors, dict(parse_json(metadata["values"]))
-
-
-class Keeper:
-    """Takes a training over from its checkpoint, and writes the next ones."""
-
-    def __init__(self, checkpoints: Checkpoints | None, training: Training) -> None:
-        processes = training.processes
-        self.checkpoints = checkpoints if processes.first else None
-        if checkpoints is None and not processes.ranks.several:
-            return
-        given = training.start, training.dataset, training.settings, training.engine.name
-        asked = configuration(*given, training.stage.schedule)
-        self.asked = processes.described(asked) | {"loss": code_for(training.start.device)}
-        if checkpoints is not None:
-            self._go_on(checkpoints, training)
-        known = {**self.asked, "checkpoint": training.done, "torch": torch.__version__}
-        processes.ranks.agree(known, "fine-tuning, before its first step")
-
-    def _go_on(self, checkpoints: Checkpoints, training: Training) -> None:
-        """Take over what a checkpoint holds, if there is one."""
-        device = "cpu" if training.processes.divided else training.start.device
-        tensors, values = checkpoints.load(self.asked, device)
-        if not values:
-            return
-        try:
-            _unpack(training, tensors, values)
-        except _UNFIT as error:
-            raise CheckpointError(
-                str(checkpoints.path),
-                f"parts that do not fit together ({error})",
-                "what a fine-tuning wrote",
-                "Begin anew with --again.",
-            ) from error
-        checkpoints.tell(
-            f"resuming at step {training.done} of {training.settings.iterations}, "
-            f"from {checkpoints.path}"
-        )
-        if values["threads"] != torch.get_num_threads():
-            checkpoints.tell(
-                f"it was begun on {values['threads']} threads, and goes on on "
-                f"{torch.get_num_threads()}: the last bits of the result may differ"
-            )
-
-    def due(self, step: int) -> bool:
-        """Whether it is time for a checkpoint after a step, by this process."""
-        return self.checkpoints is not None and self.checkpoints.due(step)
-
-    def keep(self, training: Training) -> None:
-        """Write a checkpoint, between two steps."""
-        mine = self.checkpoints is not None or training.processes.divided
-        if not mine or not training.optimizer.state:  # no step was taken
-            return
-        training.stage.check()
-        tensors, values = _packed(training)
-        if self.checkpoints is not None:  # the first process writes
-            self.checkpoints.save(tensors, values | {"configuration": self.asked})
-
-
-def _packed(training: Training) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors and plain values from which ``_unpack`` goes on; all of the model's, in the first."""
-    tensors, values = training.stage.state_dict()
-    for name, parameter in training.parameters().items():
-        tensors[f"model.{name}"] = parameter
-        moments = training.optimizer.state[parameter]
-        for moment in _MOMENTS:
-            tensors[f"{moment}.{name}"] = moments[moment]
-    for name in sorted(tensors.keys() - _OF_VIEWS):  # in the same order in all processes
-        tensors[name] = training.processes.whole(tensors[name])
-    points = [astuple(point) for point in training.curves]
-    tensors["curves"] = torch.tensor(points, dtype=torch.float64).reshape(len(points), -1)
-    return tensors, values | {
-        "done": training.done,
-        "adam_step": float(moments["step"]),
-        "seconds": training.seconds,
-        "threads": torch.get_num_threads(),
-    }
-
-
-def _unpack(training: Training, tensors: dict[str, Tensor], values: dict[str, Any]) -> None:
-    """Take over what ``_packed`` gave; raises one of ``_UNFIT`` if it does not fit."""
-    stage = training.stage
-    for name in tensors.keys() - _OF_VIEWS - {"curves"}:
-        tensors[name] = training.processes.own(tensors[name])
-    stage.load_state_dict(tensors, values)
-    if len(stage.store) != len(training.model):
-        raise ValueError(f"{len(stage.store)} thresholds of {len(training.model)} Gaussians")
-    for name, parameter in training.parameters().items():
-        parameter.data.copy_(tensors[f"model.{name}"])
-        step = torch.tensor(float(values["adam_step"]), dtype=torch.float32)
-        state: dict[str, Tensor] = {"step": step}
-        for moment in _MOMENTS:
-            state[moment] = torch.empty_like(parameter).copy_(tensors[f"{moment}.{name}"])
-        training.optimizer.state[parameter] = state
-    for row in tensors["curves"].tolist():
-        training.curves.append(StepStats(int(row[0]), *row[1:]))
-    training.done = int(values["done"])
-    if not 0 <= training.done == stage.steps <= training.settings.iterations:
-        raise ValueError(f"{training.done} steps, of which the thresholds took {stage.steps}")
-    training.started -= values["seconds"]
 
 
 def configuration(
@@ -287,11 +188,6 @@ def described(schedule: Schedule) -> dict[str, Any]:
         **numbers_of(schedule),
         "pressure": {"kind": type(pressure).__qualname__, **numbers_of(pressure)},
     }
-
-
-def differences(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
-    """Names under which two configurations differ."""
-    return [key for key in sorted(one | other) if one.get(key) != other.get(key)]
 
 
 def _of(shot: Shot) -> Iterable[Tensor | str]:

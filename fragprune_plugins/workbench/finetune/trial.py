@@ -14,7 +14,6 @@ from fragprune_plugins.learning.stage2 import evenly_spaced
 from fragprune_plugins.workbench.figures.evaluate import Candidate, psnrs
 from fragprune_plugins.workbench.finetune.loop import Training
 from fragprune_plugins.workbench.finetune.processes import Processes
-from fragprune_plugins.workbench.finetune.resuming import Keeper
 from fragprune_plugins.workbench.goals import AtMost, Faster
 from fragprune_plugins.workbench.pruning import Keep
 from fragprune_plugins.workbench.ranks import Ranks
@@ -117,7 +116,7 @@ def forgotten(
     half, alone = replace(dataset, train=learned), Processes(Ranks())
     alone.first = False  # no observer is told of its steps
     training = Training(model, half, settings, Schedule(settings), engine, alone)
-    training.learn(Keeper(None, training), progress=False)
+    training.learn(progress=False)
     other = training.result_model()
     training.end()
     before, after = (
