@@ -9,6 +9,7 @@ from typing import Any
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import RecordError
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.learning.interruption import EXIT_CODE
 from fragprune_plugins.learning.schedule import Settings
@@ -17,6 +18,7 @@ from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOpt
 from fragprune_plugins.workbench.figures import records, wording
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
 from fragprune_plugins.workbench.finetune.loop import FinetuneResult
+from fragprune_plugins.workbench.finetune.resuming import Checkpoints
 from fragprune_plugins.workbench.finetune.searching import Bounded
 from fragprune_plugins.workbench.finetune.trial import DROPOUT, KEEP
 from fragprune_plugins.workbench.models import formats
@@ -56,30 +58,56 @@ class Asked:
     photographs: Photographs | None = None
 
 
+@dataclass(frozen=True)
+class Opened:
+    """What a fine-tuning works with.
+
+    Attributes:
+        asked: the command's options, later with what a trial chose.
+        whole: the model, on ``device``; of all processes on the CPU, if they divide it.
+        photographs: where they lie; None for the model's own pictures.
+        dataset: the photographs or pictures.
+        configuration: what decides the result; a command of the same one is known again.
+        seen: the training before saw views that are held out here.
+    """
+
+    asked: Asked
+    whole: Model
+    photographs: Photographs | None
+    dataset: Dataset
+    engine: Engine
+    device: Any
+    checkpoints: Checkpoints
+    configuration: dict[str, Any]
+    seen: bool
+
+
 @dataclass(frozen=True, eq=False)
 class Finetuned:
     """A fine-tuning that is over.
 
     Attributes:
-        asked: the command's options, with what a trial chose.
         start: the model as it came in.
         forgotten: dB that a trial made other photographs worse; None without a trial.
         found: what a search for the strongest truncation found; None without one.
         truncated: the result has thresholds, here or in another process.
-        seen: training has seen held-out views, in this fine-tuning or before it.
         shards: processes that hold a part of the Gaussians each; 1 where each holds them all.
     """
 
-    asked: Asked
+    opened: Opened
     start: Candidate
     result: FinetuneResult
     forgotten: float | None
     found: Bounded | None
     truncated: bool
-    seen: bool
     shards: int = 1
 
-    def measured(self, dataset: Dataset, engine: Engine) -> dict[str, dict[str, Any]]:
+    @property
+    def asked(self) -> Asked:
+        """The command's options."""
+        return self.opened.asked
+
+    def measured(self, engine: Engine) -> dict[str, dict[str, Any]]:
         """Figures on held-out views: before, after; untruncated and control where there are any."""
         after = self.result.model
         if self._rounds and not self._as_learned:
@@ -90,7 +118,8 @@ class Finetuned:
             models["untruncated"] = Candidate(after.untruncated(), gaussians=whole)
         if self.found is not None:
             models["control"] = Candidate(self.found.control.model)
-        figures = measure_all(list(models.values()), dataset.test, engine=engine)
+        shots = self.opened.dataset.test
+        figures = measure_all(list(models.values()), shots, engine=engine)
         return dict(zip(models, figures, strict=True))
 
     @property
@@ -103,26 +132,16 @@ class Finetuned:
         """Whether figures are of the model before it was rounded: a part of it, or one chosen."""
         return self.shards > 1 or self.found is not None
 
-    def report(
-        self,
-        figures: Mapping[str, dict[str, Any]],
-        photographs: Photographs | None,
-        configuration: dict[str, Any],
-    ) -> Report:
-        """Leave a record, and say what came of it.
-
-        Args:
-            photographs: where they lie, for the record; None where there are none.
-            configuration: by which the same command is known again.
-        """
-        data = self._data(figures, configuration["photographs"])
-        asked, result = self.asked, self.result
+    def report(self, figures: Mapping[str, dict[str, Any]]) -> Report:
+        """Leave a record of figures as ``measured``, and say what came of it."""
+        data = self._data(figures)
+        asked, result, photographs = self.asked, self.result, self.opened.photographs
         text = self._text(data)
         more: dict[str, Any] = {"curves": [asdict(point) for point in result.curves]}
         if asked.itself:
             more["cameras"] = asked.scene.as_record(asked.cameras)
         if not result.interrupted:
-            more |= {"configuration": configuration, "text": text}
+            more |= {"configuration": self.opened.configuration, "text": text}
         scene = None
         if photographs is not None:
             scene = photographs.folder
@@ -132,8 +151,8 @@ class Finetuned:
         then = wording.next_steps(asked.out, folder, scene)  # records name no folders
         return Report(data, f"{text}\n{then}", exit_code=130 if result.interrupted else 0)
 
-    def _data(self, figures: Mapping[str, dict[str, Any]], pictures: str) -> dict[str, Any]:
-        """What the record and ``--json`` say, from figures as ``measured``, and a digest."""
+    def _data(self, figures: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
+        """What the record and ``--json`` say."""
         asked, result, settings = self.asked, self.result, self.result.settings
         after, control, done = figures["after"], figures.get("control"), result.progress
         if self.found is not None and self.found.control.progress.steps > done.steps:
@@ -146,8 +165,8 @@ class Finetuned:
             "after": after,
             "untruncated": figures.get("untruncated"),
             "self": asked.itself,
-            "seen": self.seen,
-            "pictures": pictures,
+            "seen": self.opened.seen,
+            "pictures": self.opened.configuration["photographs"],
             "keep": asked.keep,
             "forgotten": self.forgotten,
             "speedup": done.speedup,
@@ -192,7 +211,7 @@ class Finetuned:
             lines.append(wording.bounded(data))
         if result.interrupted:
             of = f"{data['iterations']} of {settings.iterations}"
-            lines.append(f"Interrupted at {of} iterations. {_goes_on(self.asked, self.found)}")
+            lines.append(f"Interrupted at {of} iterations. {self._goes_on()}")
         lines += wording.begun(data)
         plain = data["untruncated"]
         if plain is not None:
@@ -205,9 +224,35 @@ class Finetuned:
             lines.append("The figures above are of the model as it was learned, before rounding.")
         return "\n".join(lines)
 
+    def terminated(self) -> Report:
+        """The report after SIGTERM: the model is saved, and nothing is measured."""
+        asked, result, settings = self.asked, self.result, self.result.settings
+        data = {
+            "model": str(asked.model),
+            "out": str(asked.out),
+            "before": None,
+            "after": None,
+            "interrupted": True,
+            "iterations": result.progress.steps,
+            "train_seconds": result.train_seconds,
+            "engine": result.engine,
+            "settings": settings.as_dict(),
+        }
+        at = f"SIGTERM at {result.progress.steps} of {settings.iterations} iterations."
+        text = f"{at} Wrote {asked.out}. {self._goes_on()}"
+        return Report(data, text, exit_code=EXIT_CODE)
 
-def finished(model: Path, out: Path, asked: dict[str, Any]) -> Report | None:
-    """The report of the same command, if it has written ``out`` already; else None."""
+    def _goes_on(self) -> str:
+        if self.found is not None:
+            return "With --max-drop the same command begins anew."
+        # else it trains again
+        trained = " with --stage finetune" if self.asked.command == "run" else ""
+        return f"The same command{trained} goes on from there."
+
+
+def finished(opened: Opened) -> Report | None:
+    """The report of the same command, if it has written its ``--out`` already; else None."""
+    model, out, asked = opened.asked.model, opened.asked.out, opened.configuration
     if not out.is_file():
         return None
     try:
@@ -229,32 +274,6 @@ def finished(model: Path, out: Path, asked: dict[str, Any]) -> Report | None:
     )
     given = {"model": str(model), "out": str(out)}  # the record names them from its own folder
     return Report(data | given | {"already_finished": True}, text)
-
-
-def terminated(given: Asked, result: FinetuneResult, found: Bounded | None) -> Report:
-    """The report after SIGTERM: the model is saved, and nothing is measured."""
-    done, asked = result.progress, result.settings
-    data = {
-        "model": str(given.model),
-        "out": str(given.out),
-        "before": None,
-        "after": None,
-        "interrupted": True,
-        "iterations": done.steps,
-        "train_seconds": result.train_seconds,
-        "engine": result.engine,
-        "settings": asked.as_dict(),
-    }
-    at = f"SIGTERM at {done.steps} of {asked.iterations} iterations."
-    text = f"{at} Wrote {given.out}. {_goes_on(given, found)}"
-    return Report(data, text, exit_code=EXIT_CODE)
-
-
-def _goes_on(asked: Asked, found: Bounded | None) -> str:
-    if found is not None:
-        return "With --max-drop the same command begins anew."
-    trained = " with --stage finetune" if asked.command == "run" else ""  # else it trains again
-    return f"The same command{trained} goes on from there."
 
 
 def advise(data: dict[str, Any]) -> str | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -13,7 +13,6 @@ from fragprune_plugins.engines.cpu.memory import keep_freed_memory
 from fragprune_plugins.errors import UsageError, printable
 from fragprune_plugins.files.atomic import locked
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.learning.interruption import sigterm_interrupts
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import (
@@ -27,11 +26,9 @@ from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.figures.matching import matched, shown
 from fragprune_plugins.workbench.finetune import api, resuming
-from fragprune_plugins.workbench.finetune import finished as finetuned
-from fragprune_plugins.workbench.finetune.finished import Asked, Finetuned
-from fragprune_plugins.workbench.finetune.loop import FinetuneResult
+from fragprune_plugins.workbench.finetune.finished import Asked, Finetuned, Opened, finished
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
-from fragprune_plugins.workbench.finetune.searching import Bounded, strongest
+from fragprune_plugins.workbench.finetune.searching import strongest
 from fragprune_plugins.workbench.finetune.trial import tried
 from fragprune_plugins.workbench.goals import AtMost
 from fragprune_plugins.workbench.models import model as models
@@ -52,29 +49,6 @@ Plain grey reaches 7 to 13 dB on five scenes, black instead of a white backgroun
 """
 
 
-@dataclass(frozen=True)
-class _Opened:
-    """What a fine-tuning works with.
-
-    Attributes:
-        whole: the model, on ``device``; of all processes on the CPU, if they divide it.
-        photographs: where they lie; None for the model's own pictures.
-        dataset: the photographs or pictures.
-        configuration: what decides the result; a command of the same one is known again.
-        seen: the training before saw views that are held out here.
-    """
-
-    asked: Asked
-    whole: Model
-    photographs: Photographs | None
-    dataset: Dataset
-    engine: Engine
-    device: Any
-    checkpoints: Checkpoints
-    configuration: dict[str, Any]
-    seen: bool
-
-
 def finetune(**options: Any) -> Report | None:
     """Fine-tune, with the fields of ``Asked``; the report, in the first process."""
     asked = Asked(**options)
@@ -87,7 +61,9 @@ def finetune(**options: Any) -> Report | None:
     opened = _open(asked)
     with sigterm_interrupts():
         with joined(opened.device) as ranks:
-            known = _finished(opened) if ranks.first else None
+            if ranks.first and asked.again:
+                opened.checkpoints.clear()
+            known = finished(opened) if ranks.first and not asked.again else None
             if ranks.gather(known is not None)[0]:
                 opened.checkpoints.clear()
                 return known
@@ -95,13 +71,18 @@ def finetune(**options: Any) -> Report | None:
             over, engine = _learned(chosen, ranks, lost)
             measured = None
             if asked.shard and not over.result.terminated:  # all draw, so all measure
-                measured = over.measured(opened.dataset, engine)
+                measured = over.measured(engine)
         if not ranks.first:
             return None
-    return _report(opened, over, measured)
+    if over.result.terminated:  # after SIGTERM there is no time for measurements
+        return over.terminated()
+    report = over.report(measured or over.measured(opened.engine))
+    if not over.result.interrupted:
+        opened.checkpoints.clear()  # not before: a kill while measuring goes on from it too
+    return report
 
 
-def _open(asked: Asked) -> _Opened:
+def _open(asked: Asked) -> Opened:
     """Read the model and its photographs, or draw its pictures."""
     scene, settings, photographs = asked.scene, asked.settings, None
     if scene.data is not None or not asked.itself:
@@ -133,21 +114,12 @@ def _open(asked: Asked) -> _Opened:
     configuration = resuming.configuration(whole, dataset, settings, engine.name)
     configuration |= {"keep": asked.keep} | ({"sharded": True} if asked.shard else {})
     seen = not asked.itself and saw_held_out(asked.model, dataset)
-    return _Opened(
+    return Opened(
         asked, whole, photographs, dataset, engine, device, checkpoints, configuration, seen
     )
 
 
-def _finished(opened: _Opened) -> Report | None:
-    """The report of the same command, if it was finished before and --again was not given."""
-    asked = opened.asked
-    if asked.again:
-        opened.checkpoints.clear()
-        return None
-    return finetuned.finished(asked.model, asked.out, opened.configuration)
-
-
-def _tried(opened: _Opened) -> tuple[_Opened, float | None]:
+def _tried(opened: Opened) -> tuple[Opened, float | None]:
     """What a trial found, and the same with what it chose: dropout, and Gaussians to keep.
 
     In several processes the trials would have to agree, so none is made.
@@ -161,7 +133,7 @@ def _tried(opened: _Opened) -> tuple[_Opened, float | None]:
     return replace(opened, asked=asked), trial.forgotten
 
 
-def _warn_of_another_scene(opened: _Opened, dataset: Dataset) -> None:
+def _warn_of_another_scene(opened: Opened, dataset: Dataset) -> None:
     """Warn before the learning of photographs that the model does not show."""
     showing = shown(opened.whole, dataset, opened.engine)
     if showing < OTHER_SCENE:
@@ -177,42 +149,26 @@ def _warn_of_another_scene(opened: _Opened, dataset: Dataset) -> None:
         )
 
 
-def _learned(opened: _Opened, ranks: Ranks, lost: float | None) -> tuple[Finetuned, Engine]:
+def _learned(opened: Opened, ranks: Ranks, lost: float | None) -> tuple[Finetuned, Engine]:
     """Learn with the other processes, save the result; also the engine that draws it."""
-    asked, whole, engine = opened.asked, opened.whole, opened.engine
-    count = len(whole)
+    asked, whole, engine, dataset = opened.asked, opened.whole, opened.engine, opened.dataset
+    settings, found, count = asked.settings, None, len(whole)
     if asked.shard:
         whole, engine = part_of(whole, ranks, opened.device), ShardedEngine(engine, ranks)
     start = Candidate(whole, gaussians=count)
-    left = _keep(whole, asked, opened.dataset.to(opened.device), engine)
-    result, found = _learn(left, opened, engine, ranks)
+    left = _keep(whole, asked, dataset.to(opened.device), engine)
+    train = partial(api.finetune, left, dataset, engine=engine, progress=True, ranks=ranks)
+    if isinstance(settings.goal, AtMost):
+        found = strongest(train, settings, dataset.test, engine=engine, say=_say)
+        result = found.result
+    else:
+        result = train(settings, checkpoints=opened.checkpoints)
     saved = whole_of(result.model, ranks) if asked.shard else result.model
     if ranks.first:
         records.path_beside(asked.out).unlink(missing_ok=True)  # of the file that was there
         models.save(asked.out, saved)
-    over = Finetuned(
-        asked,
-        start,
-        result,
-        forgotten=lost,
-        found=found,
-        truncated=ranks.gather(saved.falloff is not None)[0],
-        seen=opened.seen,
-        shards=ranks.size if asked.shard else 1,
-    )
-    return over, engine
-
-
-def _report(opened: _Opened, over: Finetuned, measured: dict[str, Any] | None) -> Report:
-    """Say what came of it; before that, measure it."""
-    asked, result = opened.asked, over.result
-    if result.terminated:  # after SIGTERM there is no time for measurements
-        return finetuned.terminated(asked, result, over.found)
-    figures = measured or over.measured(opened.dataset, opened.engine)
-    report = over.report(figures, opened.photographs, opened.configuration)
-    if not result.interrupted:
-        opened.checkpoints.clear()  # not before: a kill while measuring goes on from it too
-    return report
+    truncated, shards = ranks.gather(saved.falloff is not None)[0], ranks.size if asked.shard else 1
+    return Finetuned(opened, start, result, lost, found, truncated, shards), engine
 
 
 def _keep(whole: Model, asked: Asked, dataset: Dataset, engine: Engine) -> Model:
@@ -227,15 +183,3 @@ def _keep(whole: Model, asked: Asked, dataset: Dataset, engine: Engine) -> Model
     else:
         views = views_near(shots, seed=asked.seed)
     return whole.keep(kept(whole, asked.keep, shots, views, engine=engine, progress=True))
-
-
-def _learn(
-    model: Model, opened: _Opened, engine: Engine, ranks: Ranks
-) -> tuple[FinetuneResult, Bounded | None]:
-    """Fine-tune once, or as often as a bound on the loss needs."""
-    dataset, settings = opened.dataset, opened.asked.settings
-    train = partial(api.finetune, model, dataset, engine=engine, progress=True, ranks=ranks)
-    if isinstance(settings.goal, AtMost):
-        found = strongest(train, settings, dataset.test, engine=engine, say=_say)
-        return found.result, found
-    return train(settings, checkpoints=opened.checkpoints), None
