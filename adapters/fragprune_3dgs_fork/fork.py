@@ -53,6 +53,7 @@ _MODELS = re.compile(r"\b(gaussians?|pc|model)$")
 """What functions and scripts call a model that they are given."""
 _OPTIMIZER = re.compile(r"(torch\.)?(optim\.)?\w*(Adam|SGD|RMSprop)\w*\(")
 _CAMERA = re.compile(r"view|cam")
+_LOOPS = (ast.For, ast.While)
 _MODEL_ARGUMENTS = ("pc", "gaussians", "gaussian", "model")
 
 _SET = {"iterations", "save_iterations", "checkpoint_iterations", "start_checkpoint", "model_path"}
@@ -317,10 +318,6 @@ def _rests(tree: ast.Module) -> str:
     return parts[steps[0]] if steps and parts.keys() >= {*steps} else ""
 
 
-def _is_loop(node: ast.AST) -> bool:
-    return isinstance(node, ast.For | ast.While)
-
-
 def _trainings(fork: Fork, module: str) -> tuple[str, str] | None:
     """What goes backward more than once in one pass of a script, and what is expected.
 
@@ -341,10 +338,10 @@ def _trainings(fork: Fork, module: str) -> tuple[str, str] | None:
         if isinstance(node, ast.Call):
             called = getattr(node.func, "id", "")
             own = (called in training) + (getattr(node.func, "attr", "") == "backward")
-            if called in training and looped and any(map(_is_loop, nodes(functions[called]))):
+            if called in training and looped and every(functions[called], *_LOOPS):
                 several.append(called)
                 own += 1
-        looped |= _is_loop(node)
+        looped |= isinstance(node, _LOOPS)
         return own + sum(passes(each, looped, asked) for each in ast.iter_child_nodes(node))
 
     while found := {k for k, each in functions.items() if k not in training and passes(each)}:
@@ -462,7 +459,7 @@ def _while_densifying(tree: ast.AST) -> Collection[ast.AST]:
 
 def _in_loop(tree: ast.AST, name: str) -> bool:
     """Whether a class is called in a loop."""
-    loops = every(tree, ast.For, ast.While, ast.ListComp, ast.DictComp, ast.GeneratorExp)
+    loops = every(tree, *_LOOPS, ast.ListComp, ast.DictComp, ast.GeneratorExp)
     called = (each.func for loop in loops for each in every(loop, ast.Call))
     return any(getattr(each, "id", "") == name for each in called)
 
@@ -497,9 +494,8 @@ def _methods(repo: HostRepo) -> dict[str, Function]:
 def _read_methods(fork: Fork) -> None:
     """Methods that change the model, and those of them that scripts call."""
     methods = _methods(fork.repo)
-    changing = {
-        name for name, body in methods.items() if name in STATISTICS or any(_assigned(body, "self"))
-    } | (PRIMITIVES & methods.keys())
+    known = (STATISTICS | PRIMITIVES) & methods.keys()
+    changing = known | {name for name, body in methods.items() if any(_assigned(body, "self"))}
     called = {name: {each for _, each in _method_calls(body)} for name, body in methods.items()}
     while more := {name for name in called.keys() - changing if called[name] & changing}:
         changing |= more
@@ -508,25 +504,26 @@ def _read_methods(fork: Fork) -> None:
         for name, body in methods.items()
         if "self.optimizer" in {text_of(to) for to, _ in assigned(body)} and name != "__init__"
     )
-    loops = [each for s in fork.scripts for each in nodes(fork.tree(s)) if _is_loop(each)]
+    loops = [each for script in fork.scripts for each in every(fork.tree(script), *_LOOPS)]
     trained = {name for each in loops for _, name in _method_calls(each)}
     changing -= {each for each in changing if _MAKES.fullmatch(each)} - (trained - set(fork.setups))
     still = set[str]()
     for module, tree in fork.trees.items():
         owners = reading.owners(tree)
-        statements = {each.value for each in nodes(tree) if isinstance(each, ast.Expr)}
-        for node, name in _method_calls(tree):
-            if name in changing:
-                still |= {name}
-                owner = text_of(node.func.value)  # type: ignore[attr-defined]
-                own = _MODELS.search(owner) or owner.split("[")[0] in owners
-                if own and node in fork.optional and node not in statements:
-                    fork.options |= fork.optional[node]
-                elif own and node in fork.early and node not in statements:
-                    fork.answering |= {name}
-                elif own and node not in statements:
-                    at = fork.repo.at(module, node.lineno)
-                    fork.refuse("row-change", at, f"reads what {name} returns", "a statement")
+        statements = {each.value for each in every(tree, ast.Expr)}
+        for node, name in ((node, name) for node, name in _method_calls(tree) if name in changing):
+            still |= {name}
+            owner = text_of(node.func.value)  # type: ignore[attr-defined]
+            own = _MODELS.search(owner) or owner.split("[")[0] in owners
+            if not own or node in statements:
+                continue
+            if node in fork.optional:
+                fork.options |= fork.optional[node]
+            elif node in fork.early:
+                fork.answering |= {name}
+            else:
+                at = fork.repo.at(module, node.lineno)
+                fork.refuse("row-change", at, f"reads what {name} returns", "a statement")
     fork.still = tuple(name for name in methods if name in still)
     keeps = methods.get("_prune_optimizer")
     if keeps is not None and "[mask]" not in text_of(keeps):
@@ -553,7 +550,7 @@ def _state(capture: Function) -> list[ast.expr]:
 def _taken_back(restore: Function) -> list[int]:
     """Into how many values a method unpacks its first argument."""
     first = [each.arg for each in restore.args.args[1:2]]
-    unpacked = (to for to, value in assigned(restore) if getattr(value, "id", "") in first)
+    unpacked = (to for to, value in assigned(restore) if text_of(value) in first)
     several = (each for each in unpacked if isinstance(each, ast.Tuple))
     return [len(each.elts) for each in several if not every(each, ast.Starred)]
 
@@ -591,7 +588,8 @@ def _read_changes(fork: Fork) -> None:
     for script in fork.scripts:
         trained, module = fork.tree(script), reading.module_of(script)
         owners = reading.owners(trained)
-        for node in nodes(trained):
+        for node in every(trained, ast.Assign, ast.Call):
+            at = fork.repo.at(module, node.lineno)  # type: ignore[attr-defined]
             if isinstance(node, ast.Assign) and _OPTIMIZER.match(text_of(node.value)):
                 name = text_of(node.targets[0])
             elif isinstance(node, ast.Call) and text_of(node.func).endswith("optimizer.step"):
@@ -599,12 +597,11 @@ def _read_changes(fork: Fork) -> None:
                 owner = name.rpartition(".")[0]
                 if len(node.args) == 1:  # two are those of a sparse Adam
                     found = f"another optimizer, {text_of(node)[:60]}"
-                    fork.refuse("optimizer", fork.repo.at(module, node.lineno), found, "step()")
+                    fork.refuse("optimizer", at, found, "step()")
                 if _MODELS.search(owner) or owner.split("[")[0] in {"", *owners}:
                     continue
             else:
                 continue
-            at = fork.repo.at(module, node.lineno)
             fork.warn("optimizer", at, f"stage 2 does not freeze what {name} of {script} trains")
             if f"{name}.load_state_dict(" not in text_of(trained):
                 fork.one_run = fork.one_run or f"{script} does not resume what {name} trains"
@@ -828,8 +825,7 @@ def _uses(fork: Fork, draw: Draw, name: str) -> dict[ast.AST, str]:
     body = fork.repo.function(RENDERER, draw.function)
     if body is None or name in ("", "_"):
         return {}
-    keys: set[str] = set()
-    handed: set[ast.AST] = set()
+    keys, handed = set[str](), set[ast.AST]()
     dicts = every(body, ast.Dict)
     pairs = [pair for each in dicts for pair in zip(each.keys, each.values, strict=True)]
     pairs += [(to.slice, value) for to, value in assigned(body) if isinstance(to, ast.Subscript)]

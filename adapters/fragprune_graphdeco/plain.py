@@ -117,8 +117,7 @@ def read_plain(repo: HostRepo) -> Plain:
         *_of_saving(model),
         *_of_positions(model),
         *_of_others(model),
-        *_of_scripts(repo),
-        *_of_makers(model),
+        *_of_scripts(model),
     ]
     moved = frozenset(each for each, moves in (drawn | getters).items() if moves)
     elsewhere = "" if model.module == reading.MODEL else f"{model.name} is in {model.module}"
@@ -290,20 +289,18 @@ def _of_positions(model: ModelClass) -> Iterator[str]:
         yield f"its optimizer does not train positions, which are made otherwise ({at})"
 
 
-def _of_scripts(repo: HostRepo) -> Iterator[str]:
-    """No function that draws, and scripts of which none saves a PLY."""
+def _of_scripts(model: ModelClass) -> Iterator[str]:
+    """No function that draws; scripts of which none saves a PLY, that add several pictures up, or
+    of which each makes another model in place of the one that was read.
+    """
+    repo, scripts = model.repo, _training(model.repo)
     if not any(_drawing(repo, module) for module in _renderers(repo)):
         found = "no function was found that calls a rasterizer of 3DGS"
         yield f"what draws its PLY was not read: {found}"
     if any(repo.root.glob("*.py")) and not any(map(_SAVES.search, _scripts(repo).values())):
         yield _UNSAVED
-    for script in _training(repo):
+    for script in scripts:
         yield from _of_sums(repo, script)
-
-
-def _of_makers(model: ModelClass) -> Iterator[str]:
-    """A model that every training script makes in place of the one that was read."""
-    repo, scripts = model.repo, _training(model.repo)
     made = {each: name for each in scripts for name in made_models(repo, each)}
     if made and model.method("get_xyz") and not repo.mentions(scripts, [model.name]):
         script, name = next(iter(made.items()))
@@ -685,7 +682,15 @@ class Drawing:
             if name in given and getattr(given[name], "value", None) != usual:
                 how = f"{name}={text_of(given[name])}, not {usual!r}"
                 yield f"{self.function.name} draws with {how} ({at})", False
-        yield from self._of_colours(given)
+        value = given.get("colors_precomp", ast.Constant(None))
+        roots = dict.fromkeys(root for each in self._channels(value) for root in self._roots(each))
+        others = [each for each in roots if not self._plain(each)]
+        others = [text_of(value)] if isinstance(value, ast.Call) else others
+        if others:
+            at = self.repo.at(self.module, value.lineno)
+            own = any(each.startswith(f"{self.model}.get_features") for each in roots)
+            says = f"makes colours from {', '.join(others[:4])} ({at})"
+            yield f"{self.function.name} {says}", own and self._beside(others)
 
     def shapes(self) -> Iterator[tuple[str, bool]]:
         """Likewise where its Gaussians are, and how large and opaque."""
@@ -700,21 +705,6 @@ class Drawing:
                 what = f"makes {argument} from {shown}, not from its PLY alone"
                 kept = f"{self.model}.{own.get(argument)}" in roots
                 yield f"{self.function.name} {what} ({at})", kept and self._beside(others)
-
-    def _of_colours(self, given: Mapping[str, ast.expr]) -> Iterator[tuple[str, bool]]:
-        """Colours that are no spherical harmonics of the model's features."""
-        value = given.get("colors_precomp", ast.Constant(None))
-        roots = dict.fromkeys(root for each in self._channels(value) for root in self._roots(each))
-        others = [each for each in roots if not self._plain(each)]
-        if isinstance(value, ast.Call):
-            others = [text_of(value)]
-        if others:
-            at = self.repo.at(self.module, value.lineno)
-            own = any(each.startswith(f"{self.model}.get_features") for each in roots)
-            yield (
-                f"{self.function.name} makes colours from {', '.join(others[:4])} ({at})",
-                own and self._beside(others),
-            )
 
     def _channels(self, value: ast.expr) -> Iterator[ast.expr]:
         """What the first channels are, where the picture is cut out of more."""

@@ -34,11 +34,9 @@ def optimizer_state(capture: Any, where: str) -> dict[str, Any]:
     Raises:
         ModelFileError: there is none.
     """
-    parts: list[dict[str, Any]] = [
-        part for part in capture if isinstance(part, dict) and "param_groups" in part
-    ]
-    if parts:
-        return parts[0]
+    for part in capture:
+        if isinstance(part, dict) and "param_groups" in part:
+            return part
     found, expected = "no optimizer's state in it", "one, as the host captures it"
     raise ModelFileError(where, found, expected, "Name another, or a PLY.")
 

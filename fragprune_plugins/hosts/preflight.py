@@ -7,7 +7,6 @@ from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TypeGuard
 
 from fragprune_plugins.errors import HostNeedsError
 from fragprune_plugins.hosts.source import HostRepo
@@ -93,24 +92,14 @@ def expect(
     Raises:
         HostNeedsError: something is missing.
     """
-    missing = missing_imports(repo, [script], provided)
-    absent = data is not None and not data.is_dir()
-    if not missing and not absent:
-        return
-    found, remedies = [], []
-    if missing:
-        found.append(f"not installed: {', '.join(map(str, missing))}")
-        remedies.append(install(missing))
-    if absent:
-        found.append(f"no folder {data}")
-        remedies.append("Check the path of the data.")
-    raise HostNeedsError(
-        script.name, "; ".join(found), "what the host imports and reads", "\n".join(remedies)
-    )
-
-
-Module = tuple[HostRepo, str]
-"""A module of the host's own: the folder it is found from, and its dotted name."""
+    remedies: dict[str, str] = {}
+    if missing := missing_imports(repo, [script], provided):
+        remedies[f"not installed: {', '.join(map(str, missing))}"] = install(missing)
+    if data is not None and not data.is_dir():
+        remedies[f"no folder {data}"] = "Check the path of the data."
+    if remedies:
+        found, expected = "; ".join(remedies), "what the host imports and reads"
+        raise HostNeedsError(script.name, found, expected, "\n".join(remedies.values()))
 
 
 def _foreign(repo: HostRepo, script: Path, provided: Collection[str]) -> Iterator[tuple[str, str]]:
@@ -133,7 +122,7 @@ def _foreign(repo: HostRepo, script: Path, provided: Collection[str]) -> Iterato
             for wanted in root.imported_by(name, node):
                 if any(wanted == each or wanted.startswith(f"{each}.") for each in provided):
                     continue
-                own = _own(roots, wanted)
+                own = list(_own(roots, wanted))
                 waiting += own
                 if not own and not (isinstance(node, ast.ImportFrom) and node.level):
                     yield wanted.split(".")[0], root.at(name, node.lineno)
@@ -144,27 +133,22 @@ def _imports(body: list[ast.stmt], main: bool) -> Iterator[ast.Import | ast.Impo
     for node in body:
         if isinstance(node, ast.Import | ast.ImportFrom):
             yield node
-        elif isinstance(node, ast.With) or (main and _is_main(node)):
+        elif isinstance(node, ast.With) or (
+            main
+            and isinstance(node, ast.If)
+            and isinstance(node.test, ast.Compare)
+            and "__name__" in map(ast.unparse, (node.test.left, *node.test.comparators))
+        ):
             yield from _imports(node.body, main)
 
 
-def _is_main(node: ast.stmt) -> TypeGuard[ast.If]:
-    """Whether a test is ``__name__ == "__main__"``, in either order."""
-    if not (isinstance(node, ast.If) and isinstance(node.test, ast.Compare)):
-        return False
-    return "__name__" in map(ast.unparse, (node.test.left, *node.test.comparators))
-
-
-def _own(roots: list[HostRepo], name: str) -> list[Module]:
-    """The host's own modules that an import of this name runs."""
+def _own(roots: list[HostRepo], name: str) -> Iterator[tuple[HostRepo, str]]:
+    """The host's own modules that an import of this name runs, and where they are found from."""
     parts = name.split(".")
     roots = [root for root in roots if not root.package or parts[0] == root.package]
-    prefixes = [".".join(parts[:end]) for end in range(1, len(parts) + 1)]
-    return [
-        module
-        for prefix in prefixes
-        for module in [(root, prefix) for root in roots if root.path(prefix)][:1]
-    ]
+    for end in range(1, len(parts) + 1):
+        prefix = ".".join(parts[:end])
+        yield from [(root, prefix) for root in roots if root.path(prefix)][:1]
 
 
 def _inside(repo: HostRepo, package: str) -> bool:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
@@ -19,18 +20,13 @@ from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats
 from fragprune_plugins.workbench.doctor.work import package_version
 
 
+@dataclass
 class Peer:
-    """Another rasterizer as an engine.
+    """Another rasterizer as an engine."""
 
-    Args:
-        name: of its package.
-        draw: gives the picture (3, H, W) and the radii (N,) of inputs.
-    """
-
-    def __init__(
-        self, name: str, draw: Callable[[RasterInputs, Splats], tuple[Tensor, Tensor]]
-    ) -> None:
-        self.name, self._draw = name, draw
+    name: str  # of its package
+    draw: Callable[[RasterInputs, Splats], tuple[Tensor, Tensor]]
+    """Gives the picture (3, H, W) and the radii (N,)."""
 
     def rasterize(self, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
         """Draw the splats.
@@ -42,7 +38,7 @@ class Peer:
             raise EngineError(
                 f"engine '{self.name}'", "thresholds", "Gaussians without any", "Leave them out."
             )
-        image, radii = self._draw(inputs, inputs.splats)
+        image, radii = self.draw(inputs, inputs.splats)
         return RasterOutputs(
             image=image,
             radii=radii,
@@ -55,9 +51,7 @@ class Peer:
 
 def installed() -> dict[str, str]:
     """The packages of peers that are here, with their versions."""
-    return {
-        name: package_version(name) or "unknown" for name in PEERS if find_spec(name) is not None
-    }
+    return {name: package_version(name) or "unknown" for name in PEERS if find_spec(name)}
 
 
 def peer(name: str) -> Peer:

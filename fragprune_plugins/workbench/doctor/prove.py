@@ -57,15 +57,11 @@ _CLOCKS = ("driver_version", "clocks.sm", "clocks.max.sm", "clocks.mem", "temper
 
 @dataclass(frozen=True)
 class Contestant:
-    """Who is to be proved.
-
-    Attributes:
-        ours: it knows thresholds, and must equal the oracle in everything.
-    """
+    """Who is to be proved."""
 
     name: str
     engine: Engine
-    ours: bool = True
+    ours: bool = True  # it knows thresholds, and must equal the oracle in everything
 
 
 def prove(say: Callable[[str], None] | None = None, repeats: int = 9) -> Report:
@@ -243,17 +239,16 @@ def _table(rows: Sequence[dict[str, Any]]) -> str:
     ]
     plain: dict[tuple[str, ...], float] = {}
     for row in rows:
-        key = row["round"], row["engine"], row["scene"], row["pass"]
-        faster = ""
+        key, took = (row["round"], row["engine"], row["scene"], row["pass"]), row["ms_median"]
+        cut, faster = "no", ""
         if row["truncated"]:
-            faster = f"{plain[key] / row['ms_median']:.2f}x"
+            cut, faster = "yes", f"{plain[key] / took:.2f}x"
         else:
-            plain[key] = row["ms_median"]
+            plain[key] = took
         size = f"{row['width']}x{row['height']}"
         lines.append(
-            f"{row['engine']:<28}{size:>11}  {row['pass']:<17}"
-            f"{'yes' if row['truncated'] else 'no':<8}{row['ms_median']:>11.2f}{row['ms_se']:>9.2f}"
-            f"{faster:>9}".rstrip()
+            f"{row['engine']:<28}{size:>11}  {row['pass']:<17}{cut:<8}{took:>11.2f}"
+            f"{row['ms_se']:>9.2f}{faster:>9}".rstrip()
         )
     return "\n".join(lines)
 
@@ -277,15 +272,11 @@ _FAILURES = (FragpruneError, RuntimeError, TypeError, AttributeError)
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What is drawn.
-
-    Attributes:
-        thresholds: (N,), or None for no cutoffs.
-    """
+    """What is drawn."""
 
     name: str
     inputs: RasterInputs
-    thresholds: Tensor | None
+    thresholds: Tensor | None  # (N,), or None for no cutoffs
     __repr__ = one_line
 
 
@@ -318,17 +309,14 @@ def held(engine: Engine, where: str, scene: Scene) -> dict[str, Any]:
         counted = float(fragments.double().mean())
         right = {name: each for name, each in expected.items() if name != "fragments"}
         differences += comparison.differences(scene.name, found, right)
-        off = int((fragments != expected["fragments"]).sum())
-        if off > MISCOUNTED * fragments.numel():
-            differences.append(
-                f"{scene.name}, fragments: {off} of {fragments.numel()} pixels count others"
-            )
-    view = scene.inputs.view
+        off, total = int((fragments != expected["fragments"]).sum()), fragments.numel()
+        if off > MISCOUNTED * total:
+            differences.append(f"{scene.name}, fragments: {off} of {total} pixels count others")
     return {
         "scene": scene.name,
         "gaussians": len(scene.inputs.splats),
-        "width": view.width,
-        "height": view.height,
+        "width": scene.inputs.view.width,
+        "height": scene.inputs.view.height,
         "truncated": scene.thresholds is not None,
         "stop": scene.inputs.stop,
         "fragments_per_pixel": counted,
