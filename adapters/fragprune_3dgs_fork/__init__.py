@@ -110,11 +110,8 @@ def plane_depth(channels: Tensor, settings: Any) -> Tensor:
     """(1, H, W) depth at which each pixel's ray meets its plane, 0 where nothing is drawn.
 
     There, the gradient of PGSR's kernel is infinite. No fragment of its own reads it, but
-    fragments just beyond a threshold would.
-
-    Args:
-        channels: (5 or more, H, W), normal in view space, whatever comes fourth, distance.
-        settings: of the rasterizer, with the field of view.
+    fragments just beyond a threshold would. Of the channels (5 or more, H, W) the first three are
+    the normal in view space, the fifth is the distance.
     """
     import torch
 

@@ -35,10 +35,8 @@ and the gradients. Ours have all."""
 def difference(found: Tensor | None, expected: Tensor | None, slack: int = 1) -> str:
     """How an output differs from another, for people; "" if they agree.
 
-    Args:
-        found: (C, H, W), (H, W) or one number per Gaussian.
-        expected: as many numbers.
-        slack: how many times more they may differ.
+    Both are (C, H, W), (H, W) or one number per Gaussian, and may differ ``slack`` times more than
+    by rounding.
     """
     if not isinstance(found, Tensor) or not isinstance(expected, Tensor):
         return "" if found is expected else "only one of the two exists"
@@ -55,12 +53,7 @@ def gradient_differences(
     leaves: Mapping[str, Tensor],
     slack: int = 1,
 ) -> Iterator[str]:
-    """Name every tensor whose two gradients differ, and how.
-
-    Args:
-        found: gradients by name, one row per Gaussian; None for zero.
-        slack: as in ``difference``.
-    """
+    """Name every tensor whose two gradients differ, and how: a row per Gaussian, None for zero."""
     for name, leaf in leaves.items():
         rows = [
             torch.zeros_like(leaf) if each is None else each
@@ -177,9 +170,7 @@ def _median_depth(seen: Seen) -> Tensor | None:
 def _normals(seen: Seen, *signs: int) -> Tensor | None:
     """(3, H, W) sum of alpha T n, n being the shortest axis, turned towards the camera.
 
-    Args:
-        seen: what our engine draws.
-        signs: of the axes of view space; none for the world's.
+    With signs of the axes of view space in it, else in the world.
     """
     splats, view = seen.splats, seen.inputs.view
     if splats is None or splats.scales is None or splats.rotations is None:
@@ -261,9 +252,6 @@ def chart(arguments: Mapping[str, Tensor], view: View) -> dict[str, Tensor]:
     They are as small as the low-pass filter and as wide as the picture; faint and opaque; near the
     near plane, behind it, and beyond the picture's edge; some of their colours are negative. They
     leave a part of the picture empty. Other arguments keep the host's own rows.
-
-    Args:
-        arguments: the host's, one row per Gaussian.
     """
     random, like = torch.Generator().manual_seed(7), arguments["means3D"]
     count = max(160, view.width * view.height // 48)

@@ -65,11 +65,7 @@ def _compared(function: Function) -> Iterator[tuple[ast.expr, list[ast.expr]]]:
 
 
 def _kinds(function: Function, value: ast.expr, gone: Collection[ast.AST]) -> set[str]:
-    """What a value is made of: "drawn", "photograph", and the code of all else.
-
-    Args:
-        gone: what the function does not do by its options.
-    """
+    """What a value is made of, without what is ``gone``: "drawn", "photograph", other code."""
     kinds, seen, waiting = set[str](), set[str](), [value]
     for node in waiting:  # it grows
         text = text_of(node)

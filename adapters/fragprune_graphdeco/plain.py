@@ -457,45 +457,35 @@ def _never_set(repo: HostRepo, value: str) -> bool:
 
 
 class Drawing:
-    """A drawing function: where the inputs of its rasterizer come from.
-
-    Args:
-        drawn_from: attributes of the model, and arguments, that it may draw besides those of
-            plain 3DGS.
-        call: the one that draws; by default that whose picture it returns.
-        on: arguments that are given, though they are off by default.
-
-    Attributes:
-        colours: options, off by default, under which something else makes the colours.
-    """
+    """A drawing function: where the inputs of its rasterizer come from."""
 
     def __init__(
         self,
         repo: HostRepo,
         module: str,
         function: Function,
-        drawn_from: Collection[str] = (),
-        call: ast.Call | None = None,
-        on: Collection[str] = (),
+        drawn_from: Collection[str] = (),  # what it may draw besides the values of plain 3DGS
+        call: ast.Call | None = None,  # that draws; by default that whose picture it returns
+        on: Collection[str] = (),  # arguments that are given, though they are off by default
     ) -> None:
         self.repo, self.module, self.function = repo, module, function
         self.drawn_from = drawn_from
-        arguments = function.args
-        taken = [*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs]
-        self.parameters = {each.arg for each in taken}
+        taken = function.args
+        named = (*taken.posonlyargs, *taken.args, *taken.kwonlyargs)
+        self.parameters = {each.arg for each in named}
         self.off = off_by_default(function) - {*on}
-        given = zip(reversed(arguments.args), reversed(arguments.defaults), strict=False)
-        self.switches = {
-            each.arg for each, v in given if isinstance(getattr(v, "value", None), bool)
-        }
+        given = zip(reversed(taken.args), reversed(taken.defaults), strict=False)
+        self.switches = {a.arg for a, v in given if isinstance(getattr(v, "value", None), bool)}
         self.values: dict[str, list[ast.expr]] = {}
         read = (n for n in every(function, ast.Attribute) if n.attr.startswith("get_xyz"))
         models = [each.value.id for each in read if isinstance(each.value, ast.Name)]
         self.model = models[0] if models else "pc"
         self.call = call or _call(function, self._known)
-        self.colours = set[str]()
-        named = (*self.parameters, self.model)
-        self.made: dict[str, tuple[str, ...]] = {each: (each,) for each in named}
+        self.arguments = arguments(self.call)
+        self.colours = set[str]()  # options, off by default, by which something else colours
+        self.made: dict[str, tuple[str, ...]] = {
+            each: (each,) for each in (*self.parameters, self.model)
+        }
         self.drawn = self.made
         self._collect(function.body)
         self.made = self.drawn
@@ -559,8 +549,10 @@ class Drawing:
             self.values.setdefault(target.id, []).append(value)
             self.made = self.made | {target.id: tuple(dict.fromkeys(self._roots(value)))}
 
-    def _roots(self, node: ast.expr) -> Iterator[str]:
+    def _roots(self, node: ast.expr | None) -> Iterator[str]:
         """What an expression is made of: "model.x", parameters, and "model" itself."""
+        if node is None:
+            return
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
             if self.made.get(node.value.id) == (self.model,):
                 yield from (f"{self.model}.{each}" for each in self._given_by(node.attr))
@@ -592,8 +584,8 @@ class Drawing:
 
     def selection(self) -> str:
         """The code that picks rows of what is drawn first, as ``means3D[mask]``; "" without any."""
-        call, own, seen = self.call, f"{self.model}.get_xyz", set()
-        waiting = [value for name, value in arguments(call).items() if name == "means3D"]
+        own, seen = f"{self.model}.get_xyz", set()
+        waiting = [value for name, value in self.arguments.items() if name == "means3D"]
         while waiting:
             for node in ast.walk(waiting.pop()):
                 if isinstance(node, ast.Name) and node.id not in seen:
@@ -607,28 +599,27 @@ class Drawing:
         """Why the picture is not that of the PLY, and whether its rows are drawn all the same."""
         cuts = list(self.cuts())
         if cuts and not any(re.search(r"\[0?:3[,\]]", text_of(each)) for each in cuts):
-            cut = self.repo.at(self.module, cuts[0].lineno)
-            yield f"its picture is cut out of a tensor with further channels ({cut})", False
+            at = self._at(cuts[0])
+            yield f"its picture is cut out of a tensor with further channels ({at})", False
         yield from self._others_first()
         yield from self.inputs()
         calls = read_calls(self.repo, self.module, self.function.name)
-        names = dict.fromkeys([*arguments(self.call), *(n for each in calls for n in each.given)])
+        names = dict.fromkeys([*self.arguments, *(n for each in calls for n in each.given)])
         blended = [each for each in names if _PICTURES.fullmatch(each)] or [*self._of_columns()]
         if blended:
             yield f"its rasterizer also takes {', '.join(blended)}", False
         for made in filter(None, map(self._made_into, pictures(self.function))):
-            at = self.repo.at(self.module, made.lineno)
-            yield f"its picture is made into {text_of(made)[:60]} ({at})", True
+            yield f"its picture is made into {text_of(made)[:60]} ({self._at(made)})", True
 
     def _of_columns(self) -> Iterator[str]:
         """Arguments that further columns of the PLY may be, without channels beside the colours."""
         names = {*_columns(self._model())[1]} - _PLAIN
         further = {each for each in names if not change_of(each)}
-        for name, value in arguments(self.call).items() if further else ():
-            if name not in {*ARGUMENTS, *further} and not _CHANNELS.search(name):
-                roots = (each for each in self._roots(value) if not self._plain(each))
-                if any(each.startswith(f"{self.model}.") for each in roots):
-                    yield name
+        for name, value in self.arguments.items() if further else ():
+            known = name in {*ARGUMENTS, *further} or _CHANNELS.search(name)
+            others = [] if known else self._others(value)
+            if any(each.startswith(f"{self.model}.") for each in others):
+                yield name
 
     def _others_first(self) -> Iterator[tuple[str, bool]]:
         """Another picture that the rasterizer returns before the one that counts."""
@@ -673,38 +664,40 @@ class Drawing:
         the function make them from the model's own.
         """
         yield from self.shapes()
-        given = arguments(self.call)
-        at = self.repo.at(self.module, self.function.lineno)
-        roots = dict.fromkeys(self._roots(given["shs"])) if "shs" in given else {}
-        if others := [each for each in roots if not self._plain(each)]:
-            yield f"{self.function.name} makes colours from {', '.join(others[:4])} ({at})", False
-        for name, usual in _USUAL.items():
-            if name in given and getattr(given[name], "value", None) != usual:
-                how = f"{name}={text_of(given[name])}, not {usual!r}"
-                yield f"{self.function.name} draws with {how} ({at})", False
-        value = given.get("colors_precomp", ast.Constant(None))
-        roots = dict.fromkeys(root for each in self._channels(value) for root in self._roots(each))
-        others = [each for each in roots if not self._plain(each)]
-        others = [text_of(value)] if isinstance(value, ast.Call) else others
-        if others:
-            at = self.repo.at(self.module, value.lineno)
-            own = any(each.startswith(f"{self.model}.get_features") for each in roots)
-            says = f"makes colours from {', '.join(others[:4])} ({at})"
-            yield f"{self.function.name} {says}", own and self._beside(others)
+        given, name, at = self.arguments, self.function.name, self._at(self.function)
+        if others := self._others(given.get("shs")):
+            yield f"{name} makes colours from {', '.join(others[:4])} ({at})", False
+        for argument, usual in _USUAL.items():
+            if argument in given and getattr(given[argument], "value", None) != usual:
+                how = f"{argument}={text_of(given[argument])}, not {usual!r}"
+                yield f"{name} draws with {how} ({at})", False
+        if value := given.get("colors_precomp"):
+            channels = list(self._channels(value))
+            others = [text_of(value)] if isinstance(value, ast.Call) else self._others(*channels)
+            if others:
+                roots = (root for each in channels for root in self._roots(each))
+                own = any(each.startswith(f"{self.model}.get_features") for each in roots)
+                what = f"makes colours from {', '.join(others[:4])} ({self._at(value)})"
+                yield f"{name} {what}", own and self._beside(others)
 
     def shapes(self) -> Iterator[tuple[str, bool]]:
         """Likewise where its Gaussians are, and how large and opaque."""
-        given = arguments(self.call)
-        at = self.repo.at(self.module, self.function.lineno)
         own = {"means3D": "get_xyz", "scales": "get_scaling", "rotations": "get_rotation"}
         for argument in ("means3D", "opacities", "scales", "rotations"):
-            roots = list(self._roots(given[argument])) if argument in given else []
-            others = [each for each in dict.fromkeys(roots) if not self._plain(each)]
-            if others:
-                shown = ", ".join(others[:4])
-                what = f"makes {argument} from {shown}, not from its PLY alone"
-                kept = f"{self.model}.{own.get(argument)}" in roots
-                yield f"{self.function.name} {what} ({at})", kept and self._beside(others)
+            value = self.arguments.get(argument)
+            if others := self._others(value):
+                what = f"makes {argument} from {', '.join(others[:4])}, not from its PLY alone"
+                kept = f"{self.model}.{own.get(argument)}" in self._roots(value)
+                said = f"{self.function.name} {what} ({self._at(self.function)})"
+                yield said, kept and self._beside(others)
+
+    def _others(self, *values: ast.expr | None) -> list[str]:
+        """What values are made of that a plain drawing does not read, each once."""
+        roots = dict.fromkeys(root for each in values for root in self._roots(each))
+        return [each for each in roots if not self._plain(each)]
+
+    def _at(self, node: ast.expr | Function) -> str:
+        return self.repo.at(self.module, node.lineno)
 
     def _channels(self, value: ast.expr) -> Iterator[ast.expr]:
         """What the first channels are, where the picture is cut out of more."""

@@ -164,11 +164,7 @@ class _Trial:
         self.unfelt = screens if drawn.still else set()  # only densification reads them
 
     def prove(self) -> Proof:
-        """Compare every output and every gradient.
-
-        Raises:
-            _OtherwiseError: names the first difference that matters.
-        """
+        """Compare every output and every gradient, up to the first difference that matters."""
         count, settings = len(self.drawn[self.dialect.means]), self.drawn.settings
         own = {
             name: value

@@ -233,11 +233,7 @@ class CommandLine:
     def _parsed(
         self, arguments: list[str], flags: Mapping[str, tuple[Sequence[str], dict[str, Any]]]
     ) -> dict[str, Any]:
-        """Values of flags by name, and "config"; what that file says goes before the command.
-
-        Args:
-            flags: by name, their spellings and what argparse is told of them.
-        """
+        """Values of flags by name, and "config"; what that file says goes before the command."""
         parser = Flags(add_help=False, allow_abbrev=False, conflict_handler="resolve")
         for name, (spellings, more) in flags.items():
             if spellings:

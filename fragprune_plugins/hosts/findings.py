@@ -38,18 +38,12 @@ class Finding:
 
 @dataclass(frozen=True)
 class SeamState:
-    """The state of a seam in the source.
-
-    Attributes:
-        status: "at import" where the source cannot tell, because the module is compiled.
-        at: "file:line" of the function, or of the place where it was expected; "" at import.
-        finding: the error, where there is one.
-    """
+    """The state of a seam in the source; "at import" where that is compiled, and cannot tell."""
 
     seam: Seam
     status: Literal["found", "changed", "missing", "at import"]
-    at: str = ""
-    finding: Finding | None = None
+    at: str = ""  # "file:line" of the function, or of the place where it was expected
+    finding: Finding | None = None  # the error, where there is one
 
 
 @dataclass(frozen=True)

@@ -32,15 +32,10 @@ _SAME_NAME = """
 
 @dataclass(frozen=True)
 class Missing:
-    """A package that a host imports and that is not installed.
+    """A package that a host imports and that is not installed."""
 
-    Attributes:
-        module: its import name.
-        at: "file:line" of the first import found.
-    """
-
-    module: str
-    at: str
+    module: str  # its import name
+    at: str  # "file:line" of the first import found
 
     @property
     def distribution(self) -> str | None:
@@ -68,10 +63,8 @@ def missing_imports(
     """Packages that a host's scripts import at their start and that are not installed.
 
     This follows the imports at the top of the scripts and of the host's own modules that these
-    import. It ignores imports inside ``try``, a condition or a function.
-
-    Args:
-        provided: dotted import names for which we have stand-ins.
+    import. It ignores imports inside ``try``, a condition or a function, and the dotted names for
+    which stand-ins are ``provided``.
     """
     found: dict[str, Missing] = {}
     for script in scripts:
@@ -84,14 +77,7 @@ def missing_imports(
 def expect(
     repo: HostRepo, script: Path, provided: Collection[str], data: Path | None = None
 ) -> None:
-    """Raise unless a script's packages and data are there; the error lists all missing ones.
-
-    Args:
-        provided: dotted import names for which we have stand-ins.
-
-    Raises:
-        HostNeedsError: something is missing.
-    """
+    """Raise HostNeedsError, which lists all that is missing of a script's packages and data."""
     remedies: dict[str, str] = {}
     if missing := missing_imports(repo, [script], provided):
         remedies[f"not installed: {', '.join(map(str, missing))}"] = install(missing)

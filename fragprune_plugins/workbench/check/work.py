@@ -269,23 +269,16 @@ _SHOWN = 8
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a checkout can do.
-
-    Attributes:
-        kind: "fits" (an adapter does), "several" (of them do), "inside" (one fits a folder of it),
-            "finetune" (none does, but its PLY is plain 3DGS) or "never".
-        reason: what speaks against the better answer; "" if nothing does.
-        adapter: name of the adapter that fits, or of the nearest; "" if none finds a seam.
-        differs: the differences from the nearest adapter's host.
-        inside: folders of the checkout that fit, with their adapter.
+    """What a checkout can do: an adapter fits, several do, one fits a folder inside of it, none but
+    its PLY is plain 3DGS and can be fine-tuned, or never.
     """
 
     kind: Literal["fits", "several", "inside", "finetune", "never"]
     sentence: str
-    reason: str = ""
-    adapter: str = ""
-    differs: tuple[str, ...] = ()
-    inside: tuple[tuple[str, str], ...] = ()
+    reason: str = ""  # what speaks against the better answer
+    adapter: str = ""  # that fits, or the nearest, if one finds a seam
+    differs: tuple[str, ...] = ()  # the differences from its host
+    inside: tuple[tuple[str, str], ...] = ()  # folders of the checkout that fit, and their adapter
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, for ``--json``."""
@@ -305,11 +298,9 @@ def judge(
     adapters: Sequence[HostAdapter],
     plugins: Plugins,
 ) -> Verdict:
-    """Judge a checkout.
+    """Judge a checkout by the matches of adapters with it, the nearest first.
 
-    Args:
-        tried: the match of each adapter with it, the nearest first.
-        plugins: tell which models it saves, where no adapter fits.
+    Plugins tell which models it saves, where no adapter fits.
     """
     fitting = closest(tried, adapters)
     if len(fitting) == 1:
@@ -361,11 +352,7 @@ def judge(
 
 
 def differences(repo: HostRepo, match: Match, elsewhere: str) -> tuple[str, ...]:
-    """How a checkout differs from an adapter's host, in short lines.
-
-    Args:
-        elsewhere: where the model is, as text; "" if it is where the adapter looks.
-    """
+    """How a checkout differs from an adapter's host, whose model may be ``elsewhere``, in lines."""
     lines: dict[str, None] = {elsewhere: None} if elsewhere else {}
     missing: list[str] = []
     for finding in match.errors:

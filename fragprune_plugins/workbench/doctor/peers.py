@@ -29,11 +29,7 @@ class Peer:
     """Gives the picture (3, H, W) and the radii (N,)."""
 
     def rasterize(self, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
-        """Draw the splats.
-
-        Raises:
-            EngineError: with thresholds, which it does not know.
-        """
+        """Draw the splats; raises EngineError with thresholds, which it does not know."""
         if thresholds is not None or not isinstance(inputs.splats, Splats):
             raise EngineError(
                 f"engine '{self.name}'", "thresholds", "Gaussians without any", "Leave them out."
