@@ -54,7 +54,6 @@ CHANNELS = 7
 SCREEN = 3
 """Columns of the tensor that gets the screen gradient."""
 
-
 log = logging.getLogger("fragprune")
 
 
@@ -147,14 +146,16 @@ class ForkDialect(GraphdecoDialect):
         for name, value in ((each, call.get(each)) for each in sorted(POSES)):
             if value is not None and (value.any() or (trained and value.requires_grad)):
                 self._refuse(name, "a camera's gradients", "cameras that stand still, or stage 2")
-        if not call.still and call["means2D"].shape[1] > SCREEN:
+        if call.still:
+            return inputs
+        if call["means2D"].shape[1] > SCREEN:
             self._refuse("means2D", "absolute screen gradients", "three columns, or stage 2")
-        if not call.still and fork.scaled:
+        if fork.scaled:
             warn_once(
                 f"{', '.join(sorted(fork.scaled))}: the gradient on the screen is not changed by "
                 "it here, so other Gaussians are densified than by the host's own rasterizer"
             )
-        if not call.still and fork.screens:
+        if fork.screens:
             warn_once(
                 f"{', '.join(sorted(fork.screens))}: gets no gradient here, and a densification "
                 "that reads it fails; only the host's own rasterizer computes it"
@@ -321,12 +322,12 @@ class ForkAdapter(GraphdecoAdapter):
 
     def _groups(self, repo: HostRepo) -> list[Finding]:
         """An error if a group of 3DGS is missing; others are followed, and stand still."""
-        found = graphdeco.group_names(repo.function(MODEL, f"{CLASS}.training_setup"))
-        missing = [group.name for group in self.groups if group.name not in found]
-        at = repo.place(MODEL, f"{CLASS}.training_setup")
+        setup = f"{CLASS}.training_setup"
+        found, at = graphdeco.group_names(repo.function(MODEL, setup)), repo.place(MODEL, setup)
         return [
-            Finding.error("param-groups", at, f"no group {name}", "the groups of 3DGS")
-            for name in missing
+            Finding.error("param-groups", at, f"no group {each.name}", "the groups of 3DGS")
+            for each in self.groups
+            if each.name not in found
         ]
 
     def seams_for(self, repo: HostRepo) -> tuple[Seam, ...]:
@@ -419,22 +420,22 @@ class ForkAdapter(GraphdecoAdapter):
         Raises:
             UsageError: these, or an option under which it draws or changes its model otherwise.
         """
-        parser = ArgumentParser(add_help=False, allow_abbrev=False)
-        for name in read_fork(repo).options:
+        fork, parser = read_fork(repo), ArgumentParser(add_help=False, allow_abbrev=False)
+        for name in fork.options:
             parser.add_argument(f"--{name}", nargs="?", const="", action="append")
         given = vars(parser.parse_known_args(arguments)[0])
         for name, values in ((name, values) for name, values in given.items() if values):
-            if any(value != read_fork(repo).default(name) for value in values):
+            if any(value != fork.default(name) for value in values):
                 raise UsageError(
                     f"--{name}",
                     "other draws, other values of the rasterizer, or other changes of the model",
-                    f"what was read of {', '.join(read_fork(repo).scripts)}, without it",
+                    f"what was read of {', '.join(fork.scripts)}, without it",
                     "Leave it out, or prune its PLY: fragprune finetune.",
                 )
-        if stage == "joint" and (scaled := read_fork(repo).scaled):
+        if stage == "joint" and fork.scaled:
             raise UsageError(
                 "--stage joint",
-                f"{', '.join(sorted(scaled))}, which changes the gradient that densifies",
+                f"{', '.join(sorted(fork.scaled))}, which changes the gradient that densifies",
                 "a host that densifies by the gradient itself",
                 "Leave it out: thresholds then learn after the host's own training.",
             )

@@ -602,10 +602,9 @@ def _defaults(tree: ast.Module | None) -> dict[str, list[ast.expr]]:
     return found
 
 
-def read_flags(repo: HostRepo, line: CommandLine) -> list[Finding]:
+def read_flags(repo: HostRepo, line: CommandLine) -> Iterator[Finding]:
     """An error for each training script that lacks a flag that we set, or reads no flags."""
     wanted = ("iterations", "output", "save_checkpoints", "resume")
-    found = []
     for script in line.scripts:
         tree = repo.tree(module_of(script))
         if tree is None:
@@ -614,19 +613,16 @@ def read_flags(repo: HostRepo, line: CommandLine) -> list[Finding]:
         parts = (tree, *(repo.function("arguments", each) for each in called if each))
         read = {node.attr for each in parts for node in every(each, ast.Attribute)}
         if read.isdisjoint(("parse_args", "parse_known_args")):
-            others = [name for name in imported(tree) if name in _OTHER_FLAGS]
-            by = f"it reads its settings with {', '.join(others)}" if others else "no argparse"
-            found.append((script, by, "flags, read with argparse"))
-            continue
-        flags = {*_strings(tree), *_of_groups(repo)}
-        needed = filter(None, map(line.spellings, wanted))
-        missing = [each[-1] for each in needed if not flags.intersection(each)]
-        if missing:
-            found.append((script, f"no {', '.join(missing)}", "the flags that we set"))
-    return [
-        Finding.error("flags", script, what, expected, "Its training cannot be driven.")
-        for script, what, expected in found
-    ]
+            others = ", ".join(name for name in imported(tree) if name in _OTHER_FLAGS)
+            found = f"it reads its settings with {others}" if others else "no argparse"
+            expected = "flags, read with argparse"
+        else:
+            flags = {*_strings(tree), *_of_groups(repo)}
+            needed = filter(None, map(line.spellings, wanted))
+            missing = ", ".join(each[-1] for each in needed if not flags.intersection(each))
+            found, expected = f"no {missing}" if missing else "", "the flags that we set"
+        if found:
+            yield Finding.error("flags", script, found, expected, "Its training cannot be driven.")
 
 
 def in_full(repo: HostRepo, script: Path, arguments: list[str]) -> list[str]:

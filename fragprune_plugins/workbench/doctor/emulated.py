@@ -47,24 +47,16 @@ def version_of(compiler: str) -> str:
 class EmulatedDevice:
     """Builds a source once per set of macros, for all processes that share the folder.
 
-    Args:
-        compiler: a C++17 compiler for ELF systems.
-        folder: where builds go.
-        flags: further ones of the compiler.
-
-    Attributes:
-        launched: kernels with their macros, in order.
-        opened: what was built, by source and macros.
-        seed: of the order in which threads and blocks run.
-        resident: blocks that run at a time, 1 to 3.
+    The compiler is one of C++17 for ELF systems; it may get further flags.
     """
 
     kind = "cpu"
 
     def __init__(self, compiler: str, folder: Path, flags: tuple[str, ...] = ()) -> None:
         self.compiler, self._folder, self._flags = compiler, folder, flags
-        self.seed, self.resident = 1, 3
-        self.launched: list[tuple[str, dict[str, int]]] = []
+        self.seed = 1  # of the order in which threads and blocks run
+        self.resident = 3  # blocks that run at a time, 1 to 3
+        self.launched: list[tuple[str, dict[str, int]]] = []  # kernels with their macros, in order
         self.opened: dict[tuple[str, tuple[tuple[str, int], ...]], ctypes.CDLL] = {}
 
     def launch(
