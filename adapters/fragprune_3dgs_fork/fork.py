@@ -9,16 +9,8 @@ from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, partial
 
 import fragprune_graphdeco as graphdeco
-from fragprune_3dgs_fork.rasterizer import (
-    POSES,
-    SCREEN,
-    SERVED,
-    Output,
-    blended_argument,
-    changed_gradients,
-    meaning,
-    only_asks,
-)
+from fragprune_3dgs_fork import rasterizer
+from fragprune_3dgs_fork.rasterizer import Output
 from fragprune_graphdeco import assigned, every, kernels, plain, reading, text_of
 from fragprune_plugins.adapting import Finding, Function, HostRepo, is_off, nodes, off_by_default
 
@@ -726,22 +718,22 @@ def _reached(fork: Fork, node: ast.AST) -> Iterator[str]:
 
 def _check_call(fork: Fork, at: str, function: str, call: graphdeco.CallInSource) -> None:
     """Settings and arguments besides the known ones: off, or without a part in the picture."""
-    if blended := blended_argument(fork.repo, call):
+    if blended := rasterizer.blended_argument(fork.repo, call):
         fork.blended[call.package] = blended
     if call.other_matrix:
         found = f"projmatrix is {call.other_matrix}"
         fork.refuse("rasterizer-call", at, found, "the cameras of 3DGS")
-    if POSES & call.arguments:
+    if rasterizer.POSES & call.arguments:
         fork.warn("rasterizer-call", at, "the cameras, which stand still in stage 2")
-    screens = frozenset(filter(SCREEN.fullmatch, call.arguments))
+    screens = frozenset(filter(rasterizer.SCREEN.fullmatch, call.arguments))
     fork.screens |= screens
-    given = call.arguments - SERVED - screens - {blended}
+    given = call.arguments - rasterizer.SERVED - screens - {blended}
     further = [*(call.besides - NEUTRAL), *given]
     unknown = {each for each in further if not _stays_off(fork, function, call.given.get(each))}
     fork.off |= {*further} - unknown
     for name in sorted(unknown & call.besides):
-        changed = changed_gradients(fork.repo, call.package, name)
-        if only_asks(fork.repo, call.package, name):
+        changed = rasterizer.changed_gradients(fork.repo, call.package, name)
+        if rasterizer.only_asks(fork.repo, call.package, name):
             unknown.remove(name)
             fork.asking |= {name}
         elif changed is not None and changed <= {"means2D"}:
@@ -798,7 +790,7 @@ def _output(fork: Fork, draw: Draw, call: graphdeco.CallInSource, number: int) -
         return Output(name, "image")
     if "radii" in name:
         return Output(name, "radii")
-    output = meaning(fork.repo, call, name)
+    output = rasterizer.meaning(fork.repo, call, name)
     uses = _uses(fork, draw, name) if output.role in ("unread", "unproved") else {}
     read = output.role == "unread" and kernels.normal_sources(fork.repo, package)
     at = fork.repo.at(RENDERER, call.line)

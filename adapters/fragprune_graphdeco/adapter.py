@@ -16,19 +16,7 @@ from fragprune_graphdeco import photographs, plain, reading
 from fragprune_graphdeco.call import RasterizerCall, drawing_functions, read_calls
 from fragprune_graphdeco.densifying import clones, splits
 from fragprune_graphdeco.kernels import SPLAT, Kernel, read_kernels, vendored
-from fragprune_graphdeco.reading import (
-    defaults,
-    entries,
-    every,
-    failing,
-    in_full,
-    made_models,
-    module_of,
-    read_flags,
-    read_getters,
-    text_of,
-    training_scripts,
-)
+from fragprune_graphdeco.reading import every, module_of, text_of
 from fragprune_plugins.adapting import (
     CHECKPOINT_KEY,
     GROUPS,
@@ -288,19 +276,19 @@ class GraphdecoAdapter(ScriptAdapter):
         missing = []
         for script in self.scripts_of(repo):
             missing += [] if (repo.root / script).is_file() else [f"no {script}"]
-            made = made_models(repo, module_of(script))
+            made = reading.made_models(repo, module_of(script))
             if made and "GaussianModel" not in made:
                 missing.append(f"{script} makes {', '.join(dict.fromkeys(made))}")
         for module, _, name in (each.rpartition(":") for each in self.own_names):
             module = module or MODEL
             missing += [] if repo.mentions([module], [name]) else [f"no {name} in {module}"]
-        missing += failing(repo, self.scripts_of(repo))
+        missing += reading.failing(repo, self.scripts_of(repo))
         packages = dict.fromkeys([self.package, *(c.package for c in self.calls if c.package)])
         return [
             *self.other_host(repo, missing),
             *(each for name in packages for each in read_kernels(repo, name, self.kernel)),
-            *read_getters(repo),
-            *(read_flags(repo, self.command_line(repo)) if repo.tree(MODEL) else ()),
+            *reading.read_getters(repo),
+            *(reading.read_flags(repo, self.command_line(repo)) if repo.tree(MODEL) else ()),
             *self._groups(repo),
             *self._calls(repo),
             *self._drawn(repo),
@@ -381,7 +369,7 @@ class GraphdecoAdapter(ScriptAdapter):
         """``scripts``; where a checkout has none of them, its own that train one GaussianModel."""
         if any((repo.root / name).is_file() for name in self.scripts):
             return self.scripts
-        trains = training_scripts(repo)
+        trains = reading.training_scripts(repo)
         one = (each for each in trains if len(repo.calls(module_of(each), "GaussianModel")) == 1)
         return tuple(one) or self.scripts
 
@@ -403,7 +391,7 @@ class GraphdecoAdapter(ScriptAdapter):
             images=("-i", "--images"),
             white_background=("-w", "--white_background"),
             hold_out=("--eval",),
-            in_full=partial(in_full, repo),
+            in_full=partial(reading.in_full, repo),
         )
         return replace(line, **self.flags)
 
@@ -499,7 +487,7 @@ class GraphdecoAdapter(ScriptAdapter):
         pinhole = projection is None or "[3, 2]" in text_of(projection)
         other = [] if pinhole else ["its getProjectionMatrix, which is no pinhole camera's"]
         if not self.installed:  # whose folder holds all other packages
-            why = photographs.unlike(repo, map(reading.module_of, self.scripts_of(repo)))
+            why = photographs.unlike(repo, map(module_of, self.scripts_of(repo)))
             other += [why] * (why not in ("", photographs.NOT_FOUND))
         return [f"{flag}, which our readers do not support" for flag in flags] + other
 
@@ -559,7 +547,7 @@ def _opaque(repo: HostRepo, scene: Path) -> bool:
 
 def group_names(function: Function | None) -> tuple[str, ...]:
     """Names of the param groups that a function spells out as dicts, in source order."""
-    named = (each for each in entries(function, "name") if isinstance(each, ast.Constant))
+    named = (each for each in reading.entries(function, "name") if isinstance(each, ast.Constant))
     ordered = sorted(named, key=lambda each: (each.lineno, each.col_offset))
     return tuple(str(each.value) for each in ordered)
 
@@ -598,7 +586,7 @@ def resolution(repo: HostRepo, asked: int | None) -> Resolution:
 
 def default(repo: HostRepo, name: str, otherwise: float) -> float:
     """A number that an argument group assigns to ``self.name``; else ``otherwise``."""
-    values = (getattr(each, "value", None) for each in defaults(repo, "arguments", name))
+    values = (getattr(each, "value", None) for each in reading.defaults(repo, "arguments", name))
     return next((each for each in values if isinstance(each, int | float)), otherwise)
 
 
@@ -606,7 +594,7 @@ def numbers(repo: HostRepo, script: Path, name: str) -> list[int]:
     """The default of an argument, of an argument group or of the script; [] without one."""
     module = ".".join(script.relative_to(repo.root).with_suffix("").parts)
     read: list[list[int]] = []
-    for each in (*defaults(repo, "arguments", name), *defaults(repo, module, name)):
+    for each in (*reading.defaults(repo, "arguments", name), *reading.defaults(repo, module, name)):
         with contextlib.suppress(ValueError, TypeError):
             value = ast.literal_eval(each)
             read.append([int(each) for each in (value if isinstance(value, list) else [value])])

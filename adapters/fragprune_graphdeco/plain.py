@@ -17,21 +17,7 @@ from fragprune_graphdeco import reading
 from fragprune_graphdeco.call import ARGUMENTS, RASTERIZER, read_calls
 from fragprune_graphdeco.kernels import ORDER, SPLAT, read_kernels
 from fragprune_graphdeco.photographs import unlike
-from fragprune_graphdeco.reading import (
-    ACTIVATIONS,
-    Known,
-    ModelClass,
-    assigned,
-    decided,
-    defaults,
-    every,
-    first_of,
-    made_models,
-    passed,
-    returns,
-    skipped,
-    text_of,
-)
+from fragprune_graphdeco.reading import ModelClass, assigned, every, first_of, passed, text_of
 from fragprune_plugins.adapting import (
     Function,
     HostRepo,
@@ -253,7 +239,7 @@ def _of_saving(model: ModelClass) -> Iterator[str]:
                     yield f"save_ply stores activated values, {target} = {shown}"
         if target in ("opacities", "scale") and (got := re.match(r"self\.(get_\w+_\w+)", value)):
             getter, stored = model.method(got[1]), "_scaling" if target == "scale" else "_opacity"
-            if getter is None or returns(getter, stored) != {"stored"}:
+            if getter is None or reading.returns(getter, stored) != {"stored"}:
                 yield f"save_ply stores other values, {target} = {shown}"
         if target in ("f_dc", "f_rest", "opacities", "scale", "rotation"):
             if re.match(r"np\.(zeros|ones)", value):
@@ -262,7 +248,7 @@ def _of_saving(model: ModelClass) -> Iterator[str]:
                 yield f"save_ply stores a product or sum, {target} = {shown}"
     for node in every(model.method("setup_functions"), ast.Assign):
         attribute, value = getattr(node.targets[0], "attr", ""), text_of(node.value)
-        expected = ACTIVATIONS.get(attribute, (value,))
+        expected = reading.ACTIVATIONS.get(attribute, (value,))
         if value not in expected and raw.get(attribute.removesuffix("_activation"), True):
             yield f"its {attribute} is {value[:50]} ({repo.at(module, node.lineno)})"
 
@@ -301,7 +287,7 @@ def _of_scripts(model: ModelClass) -> Iterator[str]:
         yield _UNSAVED
     for script in scripts:
         yield from _of_sums(repo, script)
-    made = {each: name for each in scripts for name in made_models(repo, each)}
+    made = {each: name for each in scripts for name in reading.made_models(repo, each)}
     if made and model.method("get_xyz") and not repo.mentions(scripts, [model.name]):
         script, name = next(iter(made.items()))
         yield f"its PLY was not read: {script}.py trains {name}, not {model.name}"
@@ -405,11 +391,11 @@ def _drawing(repo: HostRepo, module: str) -> list[ast.FunctionDef]:
     return sorted(found, key=lambda each: (each.name != "render", not pictures(each)))
 
 
-def _call(function: ast.AST, known: Known = lambda _: []) -> ast.Call | None:
+def _call(function: ast.AST, known: reading.Known = lambda _: []) -> ast.Call | None:
     """The call that draws, of several one whose picture is returned, and that is made by the values
     that are known.
     """
-    shown, gone = _shown(function), skipped(function, known)
+    shown, gone = _shown(function), reading.skipped(function, known)
     calls = [node for node in every(function, ast.Call) if "means3D" in arguments(node)]
     order = {each: (each not in shown, each in gone, each.lineno) for each in calls}
     return min(order, key=order.__getitem__, default=None)
@@ -503,7 +489,7 @@ class Drawing:
             before = self.made
             if isinstance(node, ast.If):
                 coloured = self._is_colour_option(node)
-                taken = False if coloured else decided(node.test, self._known)
+                taken = False if coloured else reading.decided(node.test, self._known)
                 self._collect([] if taken is False else node.body)
                 if not taken:
                     then, self.made = self.made, before
@@ -531,7 +517,7 @@ class Drawing:
         option = node.test.attr if isinstance(node.test, ast.Attribute) else ""
         if option in ("", "convert_SHs_python"):
             return False
-        values = list(defaults(self.repo, "arguments", option))
+        values = list(reading.defaults(self.repo, "arguments", option))
         made = any(text_of(each).startswith("colors_precomp = ") for each in node.body)
         self.colours |= {option} if made and values and all(map(is_off, values)) else set()
         return option in self.colours
