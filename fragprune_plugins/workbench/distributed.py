@@ -1,10 +1,8 @@
 """Gaussians that are divided among processes: each holds some, and draws a view of its own.
 
-The pattern is that of gsplat's ``distributed`` rasterization and of Grendel-GS. For each view, a
-process picks those of its Gaussians that can reach a pixel there, and sends them to the process
-that draws the view: 60 bytes each, with a colour instead of spherical harmonics. Gradients take the
-same way back. A truncated Gaussian reaches less far, so fewer of them are sent. Otherwise processes
-tell each other figures alone.
+As in gsplat's ``distributed`` rasterization and Grendel-GS, a process sends those of its Gaussians
+that can reach a pixel of a view to the process that draws it: 60 bytes each, with a colour instead
+of spherical harmonics. Gradients take the same way back.
 """
 
 from __future__ import annotations
@@ -196,14 +194,10 @@ class _Exchange(torch.autograd.Function):
 
 @torch.no_grad()
 def reaching(inputs: RasterInputs, splats: Splats, thresholds: Tensor | None) -> Tensor:
-    """(M,) int64, ascending: Gaussians that may have a fragment in a view, or one at their rim.
+    """(M,) int64, ascending: those ``splats`` that may have a fragment in a view, or at their rim.
 
     A fragment lies within its Gaussian's cutoff. A sphere around the cutoff is projected; those
     whose image touches no pixel are left out, and those that are too faint everywhere.
-
-    Args:
-        inputs: the view and its rules; its Gaussians are not used.
-        thresholds: (N,) falloff, or None.
     """
     view, means = inputs.view, splats.means
     rotation = view.viewmatrix[:3, :3]
@@ -300,7 +294,7 @@ class Shards(Processes):
         return configuration | parts
 
     def total(self, count: int) -> int:
-        """Gaussians of the whole model."""
+        """Gaussians of all processes."""
         return sum(self.counts)
 
     def everywhere(self, rows: Tensor) -> Tensor:
@@ -327,8 +321,7 @@ class Shards(Processes):
 def part_of(model: Model, ranks: Ranks, device: torch.device | str) -> Model:
     """This process' share of a model's Gaussians, on a device: successive rows.
 
-    Args:
-        model: the same in all processes.
+    The model must be the same in all processes.
     """
     count = len(model)
     start, end = (count * rank // ranks.size for rank in (ranks.rank, ranks.rank + 1))

@@ -46,12 +46,9 @@ def kept(
     """(N,) bool: the Gaussians that ``--keep`` leaves of N.
 
     Args:
-        model: N Gaussians and their thresholds.
         keep: a share of them in (0, 1]; "auto" for what ``keep_needed`` leaves, or "visible".
         shots: the photographs to learn from, on the model's device.
         views: whose pictures must not change.
-        engine: a name or an engine.
-        progress: draw a bar on stderr.
 
     Raises:
         InputError: the share is not in (0, 1], there is no view, or no Gaussian is visible.
@@ -61,7 +58,8 @@ def kept(
         return visible(model, views, engine=drawer)
     if not views or (keep == "auto" and not shots):
         raise InputError("keep", "no view to judge by", "at least one", "Pass views of the model.")
-    scores = removal_error(model, model.falloff, _bar(views, progress), drawer)
+    bar = tqdm(views, "scoring Gaussians", unit="view", leave=None, disable=not progress)
+    scores = removal_error(model, model.falloff, bar, drawer)
     if keep != "auto":
         return best(scores, keep)
     spared = SPARE * _error(model, shots, drawer) * len(views) / len(shots)
@@ -176,12 +174,6 @@ def removal_error(
     return scores.detach()
 
 
-def _bar(views: Sequence[View], progress: bool) -> Iterable[View]:
-    what = "scoring Gaussians"
-    bar: Iterable[View] = tqdm(views, what, unit="view", leave=None, disable=not progress)
-    return bar
-
-
 @torch.no_grad()
 def visible(model: Model, views: Sequence[View] = (), *, engine: str | Engine = "auto") -> Tensor:
     """(N,) bool: the Gaussians whose removal could change a picture.
@@ -189,15 +181,8 @@ def visible(model: Model, views: Sequence[View] = (), *, engine: str | Engine = 
     Without views, these are the Gaussians with an opacity of 1/255 or more. With views, these are
     the Gaussians that reach the centre of a pixel in at least one view, hidden by others or not.
     Without the other Gaussians, the pictures of the views are the same to the bit if activated
-    values are. (torch.sigmoid may round an opacity differently in another row.)
-
-    Args:
-        model: N Gaussians. Its own thresholds count, not the answers of plugins.
-        views: the views whose pictures must stay the same.
-        engine: a name or an engine.
-
-    Raises:
-        InputError: no Gaussian is visible.
+    values are. (torch.sigmoid may round an opacity differently in another row.) The model's own
+    thresholds count, not the answers of plugins. If no Gaussian is visible, it raises InputError.
     """
     splats = model.splats()
     seen = splats.opacities >= ALPHA_MIN

@@ -68,15 +68,11 @@ class Ranks:
                 dist.all_reduce(tensor)
 
     def exchange(self, rows: torch.Tensor, to: list[int], by: list[int]) -> torch.Tensor:
-        """Send rows to each process, and receive rows of each.
+        """Send rows (M, ...) to each process, and receive rows of each, by rank.
 
         Args:
-            rows: (M, ...) those for the first process first, and so on.
-            to: how many each process gets of this one, by rank.
+            to: how many each process gets of this one.
             by: how many this one gets of each.
-
-        Returns:
-            What this process gets, that of the first process first.
         """
         import torch.distributed as dist
 

@@ -12,11 +12,7 @@ from fragprune_plugins.plugins.loading import Plugins, Wrong
 
 
 def models_of(repo: HostRepo, plugins: Plugins) -> Sequence[Plain]:
-    """The models that a codebase saves as PLYs, its own first; one without a name if none is known.
-
-    Raises:
-        PluginError: a plugin raised, or answered something else.
-    """
+    """The models that a codebase saves as PLYs, its own first; one without a name if none is."""
 
     def wrong(answer: Any) -> Wrong | None:
         fits = isinstance(answer, list | tuple) and all(isinstance(p, Plain) for p in answer)

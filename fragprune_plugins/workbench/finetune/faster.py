@@ -33,11 +33,7 @@ _MEASURED = 5  # times at most, to meet a target
 
 
 class FrameTarget(Target):
-    """Meets a ratio of frame times.
-
-    Args:
-        ratio: frame time of the untruncated model as it came in, over that of the truncated one.
-    """
+    """Meets a ratio of frame times: of the untruncated model as it came in, over the truncated."""
 
     figure: ClassVar[str] = "faster"
 
@@ -69,11 +65,7 @@ class FrameTarget(Target):
             self.seen.add(ratio(), self.measure(views))
 
     def meet(self, store: ThresholdStore, ratio: Callable[[], float], views: Sequence[Any]) -> None:
-        """Shift all thresholds onto the target, by predictions that measurements correct.
-
-        Args:
-            ratio: of fragments, before over after, with the store as it stands.
-        """
+        """Shift all thresholds onto the target, by predictions that measurements correct."""
         for _ in range(_MEASURED):
             aim = self.ratio ** (1 / self.seen.slope(self.ratio))
             fragments = calibrate(store, ratio, aim, tolerance=_NEAR / 4)
@@ -83,11 +75,11 @@ class FrameTarget(Target):
                 break
 
     def state(self) -> dict[str, Any]:
-        """Plain values, for ``load_state``."""
+        """Also what was timed."""
         return super().state() | {"seen": list(self.seen), "timed": self.timed}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Take over what ``state`` gave; raises ValueError for anything else."""
+        """Take over what ``state`` gave, as its base does."""
         super().load_state(state)
         self.seen = Ratios(self.seen)
 
@@ -119,13 +111,9 @@ class Ratios(list[tuple[float, float]]):
 
 @torch.no_grad()
 def require_reach(target: float, model: Model, shots: Sequence[Shot], engine: Engine) -> None:
-    """Refuse a target time that thresholds cannot reach: pixels and Gaussians stay.
+    """Refuse a ratio that thresholds cannot reach, because pixels and Gaussians stay.
 
-    Args:
-        target: ratio of frame times, before over after.
-
-    Raises:
-        UsageError: frames with so few fragments as no target leaves take longer.
+    UsageError says so where frames with so few fragments as no target leaves take longer.
     """
     some, plain = evenly_spaced(shots, LIMIT_VIEWS), Candidate(model.untruncated())
     store = ThresholdStore.from_falloff(torch.full_like(plain.splats.opacities, 0.05))

@@ -66,7 +66,6 @@ class Opened:
         asked: the command's options, later with what a trial chose.
         whole: the model, on ``device``; of all processes on the CPU, if they divide it.
         photographs: where they lie; None for the model's own pictures.
-        dataset: the photographs or pictures.
         configuration: what decides the result; a command of the same one is known again.
         seen: the training before saw views that are held out here.
     """

@@ -90,7 +90,6 @@ class Training:
     Attributes:
         model: as it is now; what trains has gradients.
         rates: initial learning rates of the parameters that train, by name.
-        curves: one point for each step.
         done: steps.
         between: no step is under way.
         started: ``time.perf_counter()`` at its start, minus what was trained before a checkpoint.

@@ -12,12 +12,9 @@ from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.engines.losses import compiled_loss
 from fragprune_plugins.learning.losses import SSIM_WEIGHT, ssim_map
 
-Code = Literal["cpu", "fused-ssim", "torch"]
-"""Who computes a loss. Results differ in their last bits."""
 
-
-def code_for(device: torch.device) -> Code:
-    """Who computes the loss of float32 images on a device."""
+def code_for(device: torch.device) -> Literal["cpu", "fused-ssim", "torch"]:
+    """Who computes the loss of float32 images on a device. Results differ in their last bits."""
     if device.type == "cpu" and binding.available():
         return "cpu"
     if device.type == "cuda" and find_spec("fused_ssim") is not None:

@@ -31,7 +31,7 @@ class SharedStage(Stage2):
     _visited = (0, 0)  # how many pictures were known before this step
 
     def begin(self, opacities: Callable[[], Tensor]) -> StepPlan:
-        """A step begins; see ``Stage2``."""
+        """Note what is known before a step; see ``Stage2``."""
         self._visited = len(self._before), len(self._after)
         return super().begin(opacities)
 
@@ -40,12 +40,10 @@ class SharedStage(Stage2):
         return self._views.rows()
 
     def share(self, views: Sequence[Hashable], figures: Tensor) -> None:
-        """This step's views were drawn by several processes: take over the figures of all.
+        """This step's views, in the same order in every process, were drawn by several.
 
-        Args:
-            views: all of this step, in the same order in every process.
-            figures: (V, 4), the rows that ``figures`` gave in the processes that drew them:
-                fragments per pixel now and before, what the pressure acts on, and the loss.
+        The rows of figures (V, 4) are those that ``figures`` gave in the processes that drew them:
+        fragments per pixel now and before, what the pressure acts on, and the loss.
         """
         for known, count in zip((self._before, self._after), self._visited, strict=True):
             for picture in list(known)[count:]:  # the order of what is new must be the same
@@ -105,9 +103,7 @@ class Processes:
     ) -> None:
         """Take over from all processes gradients and figures; and whether to end, or to keep.
 
-        Args:
-            learned: all that learns, by name.
-            due: it is time for a checkpoint after this step, by this process.
+        ``due`` says that it is time for a checkpoint after this step, by this process.
         """
         if not self.ranks.several:
             return
@@ -158,13 +154,11 @@ class Processes:
         views: int,
         flags: Sequence[bool],
     ) -> tuple[Tensor, list[bool]]:
-        """Make gradients those of all views of a step; tell each process all figures.
+        """Make gradients of leaves those of all views of a step, by one reduction of one tensor.
 
-        It is one reduction of one tensor.
+        A leaf has a gradient afterwards if it has one in any process.
 
         Args:
-            leaves: the tensors that learn. Their gradients are changed in place, and are there
-                afterwards if any process has one.
             rows: four figures of each view that this process drew, of ``views`` in all.
             flags: what this process noticed.
 
@@ -176,7 +170,11 @@ class Processes:
             table[self.ranks.rank :: self.ranks.size] = table.new_tensor(rows)
         noticed = table.new_tensor(flags)
         there = table.new_tensor([leaf.grad is not None for leaf in leaves])
-        *sums, there, noticed, table = self._summed([*self._told(leaves), there, noticed, table])
+        parts = [*self._told(leaves), there, noticed, table]
+        flat = torch.cat([part.reshape(-1) for part in parts])
+        self.ranks.sum(flat)
+        pieces = flat.split_with_sizes([part.numel() for part in parts])
+        *sums, there, noticed, table = map(torch.Tensor.view_as, pieces, parts)
         for leaf, total, some in zip(leaves, sums, there.tolist(), strict=True):
             leaf.grad = self._gradient(leaf, total) if some else None
         return table, [some > 0 for some in noticed.tolist()]
@@ -188,9 +186,3 @@ class Processes:
     def _gradient(self, leaf: Tensor, total: Tensor) -> Tensor:
         """A leaf's gradient, from what all processes told together."""
         return total
-
-    def _summed(self, parts: Sequence[Tensor]) -> list[Tensor]:
-        flat = torch.cat([part.reshape(-1) for part in parts])
-        self.ranks.sum(flat)
-        pieces = flat.split_with_sizes([part.numel() for part in parts])
-        return [piece.view_as(part) for piece, part in zip(pieces, parts, strict=True)]

@@ -79,13 +79,8 @@ class Checkpoints:
     def save(self, tensors: dict[str, Tensor], values: dict[str, Any]) -> None:
         """Write a checkpoint durably in the place of the one before.
 
-        Where that fails, the one before stays, and somebody is told.
-
-        Args:
-            values: whatever JSON can hold; floats come back to the bit.
-
-        Raises:
-            DivergedError: a tensor holds NaN or infinity. The one before stays.
+        Where that fails, the one before stays, and somebody is told. It stays, too, where a tensor
+        holds NaN or infinity: DivergedError. Floats in ``values`` come back to the bit.
         """
         expect_finite({k: each for k, each in tensors.items() if k != "curves"}, str(self.path))
         content = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
@@ -103,8 +98,8 @@ class Checkpoints:
     def load(self, asked: dict[str, Any], device: Any) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Read the checkpoint; ({}, {}) if there is none.
 
-        Raises:
-            CheckpointError: it cannot be read, or has another ``configuration`` than is asked for.
+        One that cannot be read, or has another configuration than is asked for, is a
+        CheckpointError.
         """
         if not self.path.exists():
             return {}, {}
@@ -154,12 +149,7 @@ def configuration(
     engine: str,
     schedule: Schedule | None = None,
 ) -> dict[str, Any]:
-    """What decides the result of a fine-tuning, as plain values.
-
-    Args:
-        model: as it comes in, with its thresholds.
-        dataset: its files are read whole, for their digest.
-    """
+    """What decides the result of a fine-tuning, as plain values; files are read for digests."""
     shots = (*dataset.train, *dataset.test)
     store = model.thresholds
     known: list[Tensor | str] = [] if store is None or store.neutral else [*store.numbers.values()]

@@ -102,11 +102,7 @@ def strongest(
     """Train the control, then with ever better chosen pressures.
 
     The loss grows nearly in proportion to the pressure: the two trials next to the bound say where
-    to try next.
-
-    Args:
-        train: makes one fine-tuning of the model.
-        settings: of every training; their goal is ``AtMost``.
+    to try next. ``train`` makes one fine-tuning of the model.
     """
     assert isinstance(settings.goal, AtMost)
     say("Training the control, without pruning.")

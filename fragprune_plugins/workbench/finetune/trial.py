@@ -32,13 +32,7 @@ _FEWEST = 8  # photographs, to tell anything
 
 @dataclass(frozen=True)
 class Trial:
-    """What a training does, after a trial or without one.
-
-    Attributes:
-        settings: to learn with.
-        keep: the Gaussians to begin with; all if None.
-        forgotten: what the trial found, see ``forgotten``; None without one.
-    """
+    """What to learn with and to begin with; and what ``forgotten`` gave, if a trial was made."""
 
     settings: Settings
     keep: Keep | None = None
@@ -61,8 +55,6 @@ def tried(
     that it has if it was pruned before, or if a target is a ratio to what it began with.
 
     Args:
-        model: not changed.
-        dataset: its photographs, on the model's device.
         settings, keep: that were asked for.
         say: is told what is tried, and what came of it, in a sentence each.
     """
@@ -95,13 +87,8 @@ def forgotten(
     """How much worse a model shows photographs after some steps on the others, in dB.
 
     What a model has learned of the scene, steps on every second photograph improve or leave as it
-    is. What it has learned of the single photographs, such as their noise, they overwrite.
-
-    Args:
-        model: not changed. One that is pruned already keeps its thresholds.
-        dataset: its photographs, on the model's device.
-        seed: of the order of views.
-        say: is told in a sentence what is tried, before.
+    is. What it has learned of the single photographs, such as their noise, they overwrite. A model
+    that is pruned already keeps its thresholds.
 
     Returns:
         PSNR before minus PSNR after, the mean over at most 24 views; None for fewer than eight

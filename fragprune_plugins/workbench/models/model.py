@@ -61,7 +61,14 @@ def load(
         SidecarError: the sidecar is broken, another model's, or has another number of rows.
     """
     path = Path(path)
-    _expect_whole(path)
+    if path.with_name(DEFORMATION).exists():
+        raise ModelFileError(
+            str(path),
+            f"Gaussians that no view shows: the network beside them ({DEFORMATION}) moves them for "
+            "each moment",
+            "a model that one file holds",
+            "Draw it with its training code: fragprune run -- python render.py -m OUTPUT.",
+        )
     paired = truncation and formats.found(path).paired
     while True:  # until nobody replaced the pair meanwhile
         before = _versions(path)
@@ -75,18 +82,6 @@ def load(
         else:
             if _versions(path) == before:
                 return model if truncation and model.pruned else model.untruncated()
-
-
-def _expect_whole(path: Path) -> None:
-    """Raise ModelFileError if the file is drawn only after a network has moved its Gaussians."""
-    if path.with_name(DEFORMATION).exists():
-        raise ModelFileError(
-            str(path),
-            f"Gaussians that no view shows: the network beside them ({DEFORMATION}) moves them for "
-            "each moment",
-            "a model that one file holds",
-            "Draw it with its training code: fragprune run -- python render.py -m OUTPUT.",
-        )
 
 
 def _versions(path: Path) -> list[tuple[int, ...] | None]:
@@ -150,12 +145,7 @@ def writable_folder(path: Path) -> Path:
 
 
 def require_place(out: Path, model: Path, *, thresholds: bool = True) -> None:
-    """Check, before any work, that ``out`` can be written and is not ``model``.
-
-    Args:
-        out: the model to write, of any format.
-        model: the model to read.
-        thresholds: whether ``out`` is to have thresholds.
+    """Check, before any work, that ``out`` can be written and is not ``model``, which is read.
 
     Raises:
         UsageError: ``out`` and ``model`` have the same name, or of two PLYs that of their sidecar.
@@ -177,12 +167,7 @@ def require_place(out: Path, model: Path, *, thresholds: bool = True) -> None:
 
 
 def describe_written(out: Path, held: str = "", *, pruned: bool = True) -> str:
-    """What a model was written into, and what its format does not keep.
-
-    Args:
-        held: how it holds thresholds, as words; "" where there are none.
-        pruned: whether the model has thresholds.
-    """
+    """What a model was written into, how it holds thresholds, and what its format does not keep."""
     form = formats.named(out)
     cut = f", and cutoffs {form.thresholds}" if pruned and form.thresholds else ""
     kept = f" A {form.suffix} file keeps {form.keeps}{cut}." if form.keeps else ""

@@ -56,11 +56,7 @@ class Unserved:
     unlike: str = ""
 
     def train(self, *, quietly: bool) -> None:
-        """Run the command in a process of its own; with ``quietly`` it prints to stderr.
-
-        Raises:
-            HostFailed: it ended with an error code.
-        """
+        """Run the command in a process of its own; with ``quietly`` it prints to stderr."""
         words = [sys.executable, *self.program, *self.arguments]
         with sigterm_interrupts(), subprocess.Popen(words, stdout=2 if quietly else None) as host:
             try:
@@ -78,9 +74,6 @@ class Unserved:
         """The PLY that it wrote last, since a time; what it makes of one lies in folders below it.
 
         Another folder than the one that it names may be another training's.
-
-        Raises:
-            HostFailed: there is none.
         """
         folder = self.output or Path.cwd()
         found = [each for each in folder.rglob("point_cloud.ply") if each.stat().st_mtime >= since]
@@ -132,11 +125,6 @@ def train_then_finetune(
     Args:
         stage: "auto", or "finetune" for a host that has trained already.
         json: stdout gets our object only.
-
-    Raises:
-        DatasetError: we cannot read its photographs.
-        HostFailed: it ended with an error code, or left no model.
-        UsageError: a control of a model that learns from its own pictures, or several processes.
     """
     if launched().several:
         raise UsageError(

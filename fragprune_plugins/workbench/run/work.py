@@ -125,11 +125,7 @@ def _launched(command: Sequence[str], options: launch.RunOptions) -> launch.RunS
 
 
 def _expect_thresholds(summary: launch.RunSummary, settings: Settings) -> None:
-    """The model that stage 2 ended with still has what was learned in it or beside it.
-
-    Raises:
-        SidecarError: it has none: the host moved the file, or wrote another one, after it saved.
-    """
+    """Refuse a model without what stage 2 learned: the host moved or wrote files after it saved."""
     model = summary.model_after
     if model is None or model.suffix != ".ply":  # a host's checkpoint holds them itself
         return

@@ -91,9 +91,7 @@ class Pictures:
     """Pixels in slots. What came while there was room stays; what does not fit is read at each use.
 
     Views come in random orders, in which pixels that make room for others would come back too late.
-
-    Args:
-        room: bytes to keep.
+    ``room`` is in bytes.
     """
 
     def __init__(self, room: int) -> None:

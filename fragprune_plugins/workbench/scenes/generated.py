@@ -47,10 +47,8 @@ _BESIDE = (-0.6, 0.6)  # of the way; visitors leave the path of the photographs 
 
 
 def bounds(splat: Model) -> tuple[Tensor, float]:
-    """Where most of a splat is: the median of the means, and the radius of nine tenths around it.
-
-    Returns:
-        (3,) on the CPU, and world units above 0.
+    """Where most of a splat is: the median of the means (3,), on the CPU, and the radius of nine
+    tenths around it, world units above 0.
     """
     means = splat.xyz.detach().cpu()
     centre = means.median(dim=0).values
@@ -81,12 +79,7 @@ def around(
     """Cameras all around a splat, evenly spread over a sphere; from below, too.
 
     They look at its robust centre from where nine tenths of it fill the picture, or from nearer;
-    at a small splat from farther away, through a narrower lens.
-
-    Args:
-        pixels: of each side of their pictures.
-        background: (3,) RGB; black when None.
-        seed: of the distances.
+    at a small splat from farther away, through a narrower lens. ``pixels`` are those of a side.
     """
     stream = random.Random(seed)
     centre, radius = bounds(splat)
@@ -101,12 +94,7 @@ def around(
 
 
 def within(places: Sequence[Tensor], count: int, *, pixels: int = 800) -> Named:
-    """Cameras that look around from places inside a splat, to all sides and a little up and down.
-
-    Args:
-        places: (3,) each, taken in turns.
-        pixels: of each side of their pictures.
-    """
+    """Cameras at places (3,) inside a splat, in turns: to all sides, a little up and down."""
     views = []
     for number in range(count):
         eye = places[number % len(places)].detach().float().cpu()
@@ -127,10 +115,6 @@ def between(cameras: Named, *, seed: int = 0) -> Named:
     """Cameras between each given one and those near it, in place and in what they look at.
 
     There are up to four for each camera: none towards one that looks more than a quarter turn away.
-
-    Args:
-        cameras: the given ones, on one device.
-        seed: of how far each is on the way.
     """
     stream = random.Random(seed)
     return [
@@ -141,14 +125,9 @@ def between(cameras: Named, *, seed: int = 0) -> Named:
 
 
 def beside(cameras: Named, count: int, *, seed: int = 0) -> Named:
-    """Cameras next to given ones: on the way to one nearby, or on the way away from it.
+    """Cameras next to given ones, in turns: on the way to one nearby, or on the way away from it.
 
     There are none if no two of the given ones look the same way.
-
-    Args:
-        cameras: the given ones, on one device.
-        count: of cameras; they take turns at being next to each given one.
-        seed: of which one is nearby, and how far the way is.
     """
     stream, found = random.Random(seed), []
     near = [(i, others) for i, others in enumerate(_neighbours(cameras)) if others]
@@ -190,11 +169,8 @@ def _neighbours(cameras: Named) -> list[list[int]]:
 def interpolate(a: View, b: View, t: float) -> View:
     """The camera at ``t`` of the way from one to another, with the lens and picture of the first.
 
-    Its centre lies on the straight line between theirs; its rotation is the spherical
-    interpolation of theirs, the short way round.
-
-    Args:
-        t: 0 to 1 on the way; outside, straight on and turning on.
+    Its centre lies on the straight line between theirs; its rotation is the spherical interpolation
+    of theirs, the short way round. Outside 0 to 1 it goes straight on and turns on.
     """
     one, other = (view.viewmatrix.detach().double().cpu() for view in (a, b))
     ends = Rotation.from_matrix([one[:3, :3].T.numpy(), other[:3, :3].T.numpy()])
@@ -265,7 +241,13 @@ def own_pictures(
         EngineError: no such engine here.
     """
     model = models.of(model)
-    draw = _drawing(model, engine)
+    drawer, splats, thresholds = engine_for(engine, model.device), model.splats(), model.falloff
+
+    @torch.no_grad()
+    def draw(view: View) -> Tensor:
+        inputs = RasterInputs(view, splats, planes=(), **model.rules)
+        return drawer.rasterize(inputs, thresholds).image
+
     views = around(model, seed=seed) if cameras is None else cameras
     if held_out is None:
         if len(views) < 2:
@@ -277,16 +259,3 @@ def own_pictures(
         for part in ([*views, *between(views, seed=seed)], held_out)
     )
     return Dataset(train, test).to(model.device)
-
-
-def _drawing(model: Model, engine: str | Engine) -> Callable[[View], Tensor]:
-    """Draws a model as it is now, (3, H, W)."""
-    drawer = engine_for(engine, model.device)
-    splats, thresholds = model.splats(), model.falloff
-
-    @torch.no_grad()
-    def draw(view: View) -> Tensor:
-        inputs = RasterInputs(view, splats, planes=(), **model.rules)
-        return drawer.rasterize(inputs, thresholds).image
-
-    return draw

@@ -39,10 +39,7 @@ def find_image(path: Path) -> Path:
     """The image file that a scene lists: the path, or one of its folder and stem.
 
     Scenes list images without a suffix (Blender's), or with that of the images before they were
-    made smaller or renamed (.JPG, .png).
-
-    Returns:
-        The path of the file; the path as it came if there is no file, or more than one.
+    made smaller or renamed (.JPG, .png). If there is no file, or more than one, it is the path.
     """
     if path.is_file():
         return path

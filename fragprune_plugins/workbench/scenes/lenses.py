@@ -54,9 +54,6 @@ class Lens:
         """The pinhole camera at this pose whose photograph ``straighten`` makes.
 
         It has as many pixels, and sees as much as it can without a pixel that the photograph lacks.
-
-        Raises:
-            DatasetError: the lens has distortion, and OpenCV is not installed.
         """
         own = self._camera(rotation, translation)
         if self.straight:
@@ -78,11 +75,9 @@ class Lens:
         return Camera(rotation, translation, *numbers)
 
     def straighten(self, pixels: Pixels, camera: Camera) -> Pixels:
-        """A photograph as the pinhole ``camera`` sees it.
+        """A photograph (H, W, channels), of any size with the lens's aspect, as ``camera`` sees it.
 
-        Args:
-            pixels: (H, W, channels) bytes, of any size with the lens's aspect.
-            camera: what ``camera`` gave, of any size with that aspect.
+        The latter is what the method of that name gave, of any size with that aspect.
         """
         cv2 = _opencv()
         height, width = pixels.shape[:2]

@@ -38,11 +38,7 @@ log = logging.getLogger(__name__)
 
 
 def newest_model(folder: Path) -> Path:
-    """The PLY of the highest iteration in an output folder, or in the only one of a folder's.
-
-    Raises:
-        ModelFileError: there is none, or several output folders lie in the folder.
-    """
+    """The PLY of the highest iteration in an output folder, or in the only one of a folder's."""
     outputs = {each.parent for each in folder.glob("*/point_cloud")}
     one = len(outputs) == 1 and not (folder / "point_cloud").exists()
     inside = outputs.pop() if one else folder
@@ -77,10 +73,8 @@ def cameras_of(model: Path) -> Path | None:
 def trained_on(model: Path) -> Photographs | None:
     """The photographs of a model's training, by the arguments in its output folder; else None.
 
-    A training without ``--eval`` held no view out, which is warned of.
-
-    Raises:
-        DatasetError: the arguments cannot be read.
+    A training without ``--eval`` held no view out, which is warned of. Arguments that cannot
+    be read are a DatasetError.
     """
     if (known := _arguments(model)) is None:
         return None
@@ -97,7 +91,7 @@ def saw_all(model: Path) -> bool:
     """Whether the training of a model, by the arguments in its output folder, held no view out."""
     with contextlib.suppress(DatasetError):
         known = _arguments(model)
-        return known is not None and not known[1]
+        return bool(known and not known[1])
     return False
 
 
@@ -134,7 +128,7 @@ def over_white(model: Path) -> bool:
     """Whether the training of a model, by the arguments in its output folder, drew over white."""
     with contextlib.suppress(DatasetError):
         known = _arguments(model)
-        return known is not None and known[0].white_background
+        return bool(known and known[0].white_background)
     return False
 
 

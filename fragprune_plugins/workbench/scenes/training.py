@@ -77,9 +77,6 @@ def exposed(model: Path) -> str:
 
     What it drew had to be like the photograph only under that exposure. Hosts keep them as
     ``exposure.json``: the rows of a (3, 4) matrix by name, the identity if they learned none.
-
-    Raises:
-        DatasetError: the file cannot be read.
     """
     folder = output_folder(model)
     path = folder / "exposure.json" if folder else None

@@ -47,10 +47,8 @@ def read(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]
     """Read training and held-out views of Blender's pair of files, else of nerfstudio's one.
 
     One file may name its ``train_filenames``, and its ``test_filenames`` or ``val_filenames``.
-    Otherwise every 8th of the sorted names is held out, as of COLMAP's.
-
-    Args:
-        images: name of the folder with the images, if it is another than the file says.
+    Otherwise every 8th of the sorted names is held out, as of COLMAP's. ``images`` names the folder
+    with the images, if it is another than the file says.
     """
     if (folder / PAIR[0]).exists():
         train, test = (read_transforms(folder / name, images) for name in PAIR)

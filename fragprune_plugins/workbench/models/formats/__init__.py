@@ -107,11 +107,8 @@ def found(path: Path) -> Format:
 def read(path: Path, *, filtered: bool = False) -> Model:
     """Read a model of any format; thresholds that the file itself holds are in the result.
 
-    Args:
-        filtered: accept a PLY that the caller draws by its host's rules, as ``read_ply`` does.
-
-    Raises:
-        ModelFileError: missing, truncated, of another kind, empty or not finite.
+    ``filtered`` is that of ``read_ply``. A file that is missing, truncated, of another kind, empty
+    or not finite raises ModelFileError.
     """
     from fragprune_plugins.files.ply import expect_drawable, read_ply
 
@@ -125,13 +122,9 @@ def read(path: Path, *, filtered: bool = False) -> Model:
 
 
 def write(form: Format, new: Path, model: Model) -> None:
-    """Write a model into a file that does not exist yet.
+    """Write a model into a file that does not exist yet, in a folder that ``atomic.staging`` gave.
 
-    Args:
-        new: the file, in a folder that ``atomic.staging`` or ``atomic.replacing`` gave.
-
-    Raises:
-        OutputError: the format cannot hold the model or its thresholds.
+    A format that cannot hold the model or its thresholds raises OutputError.
     """
     from fragprune_plugins.workbench.models.formats.ply import write_ply
 

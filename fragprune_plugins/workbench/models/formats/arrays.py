@@ -164,11 +164,7 @@ def z_order(xyz: Floats) -> npt.NDArray[np.int64]:
 
 
 def turned(splat: Model, signs: tuple[int, int, int]) -> Model:
-    """The same scene with axes negated: means, rotations and SH of degrees 1 to 3.
-
-    Args:
-        signs: of x, y and z, 1 or -1.
-    """
+    """The same scene with axes negated by signs 1 or -1: means, rotations, SH of degrees 1 to 3."""
     x, y, z = signs
     per_axis = torch.tensor(signs, dtype=torch.float32)
     turn = torch.tensor([1, y * z, x * z, x * y], dtype=torch.float32)
@@ -183,11 +179,7 @@ def turned(splat: Model, signs: tuple[int, int, int]) -> Model:
 
 
 def take(stream: Any, count: int) -> bytes:
-    """Exactly so many bytes of a stream that decompresses; allocates no more than it gives.
-
-    Raises:
-        EOFError: the stream ends before.
-    """
+    """Exactly so many bytes of a stream that decompresses; allocates no more than it gives."""
     pieces: list[bytes] = []
     missing = count
     while missing:
