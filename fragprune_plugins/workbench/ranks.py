@@ -61,10 +61,8 @@ class Ranks:
 
     def sum(self, tensor: torch.Tensor) -> None:
         """Add up a tensor over all processes, in place; each gets the same bits."""
-        import torch.distributed as dist
-
         if self.several:
-            with self._together():
+            with self._together() as dist:
                 dist.all_reduce(tensor)
 
     def exchange(self, rows: torch.Tensor, to: list[int], by: list[int]) -> torch.Tensor:
@@ -74,23 +72,19 @@ class Ranks:
             to: how many each process gets of this one.
             by: how many this one gets of each.
         """
-        import torch.distributed as dist
-
         if not self.several:
             return rows
         received = rows.new_empty(sum(by), *rows.shape[1:])
-        with self._together():
+        with self._together() as dist:
             dist.all_to_all_single(received, rows.contiguous(), by, to)
         return received
 
     def gather(self, value: Any) -> list[Any]:
         """A plain value of each process, by rank."""
-        import torch.distributed as dist
-
         if not self.several:
             return [value]
         values: list[Any] = [None] * self.size
-        with self._together():
+        with self._together() as dist:
             dist.all_gather_object(values, value)
         return values
 
@@ -109,10 +103,12 @@ class Ranks:
                 )
 
     @contextlib.contextmanager
-    def _together(self) -> Iterator[None]:
-        """State what a collective operation raises."""
+    def _together(self) -> Iterator[Any]:
+        """torch's collective operations; what one raises is stated."""
+        import torch.distributed as dist
+
         try:
-            yield
+            yield dist
         except RuntimeError as error:  # of gloo, NCCL or the store; each has words of its own
             said = re.sub(r"^\[.*?\] ", "", str(error).strip()).split(". ")[0][:200]
             raise RanksError(

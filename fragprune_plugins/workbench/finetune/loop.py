@@ -137,7 +137,7 @@ class Training:
         }
         self.model = replace(start, **leaves, thresholds=None)
         self.rates = {name: rate * settings.rate for name, rate in rates.items()}
-        groups = [{"params": [each], "lr": self.rates[name]} for name, each in leaves.items()]
+        groups = [{"params": [leaf], "name": name} for name, leaf in leaves.items()]
         self.optimizer = torch.optim.Adam(groups, eps=EPSILON)
         self._plain_first = False  # a view of this step is drawn for the first time somewhere
         if self.stage.target is not None:
@@ -300,11 +300,10 @@ class Training:
         stage.picture = ", ".join(shot.name for shot in shots)
         due = self._due(self.done + 1)
         self.processes.went_backward(stage, self._learned(), shots, waiting, due=due)
-        rates = self.rates.items()
-        for group, (name, base) in zip(self.optimizer.param_groups, rates, strict=True):
-            group["lr"] = stage.rate(name, base)
-        gradients = {name: each.grad for name, each in self.parameters().items()}
-        stage.expect_sound({name: each for name, each in gradients.items() if each is not None})
+        for group in self.optimizer.param_groups:
+            group["lr"] = stage.rate(group["name"], self.rates[group["name"]])
+        leaves = self.parameters().items()
+        stage.expect_sound({name: leaf.grad for name, leaf in leaves if leaf.grad is not None})
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         stage.end()

@@ -109,7 +109,7 @@ def run(
         read = photographs and photographs.as_dict()
         more = {"curves": summary.curves, "photographs": read}
         records.leave(summary.model_after, "run", data | more)
-    return Report(data, _describe(summary, data, not_compared))
+    return Report(data, _describe(summary, data))
 
 
 def _launched(command: Sequence[str], options: launch.RunOptions) -> launch.RunSummary | Unserved:
@@ -243,9 +243,7 @@ def measure_models(read: records.Recorded, engine: EngineOptions) -> list[dict[s
     return measure_all(candidates, dataset.test, engine=rasterizer)
 
 
-def _describe(
-    summary: launch.RunSummary, data: dict[str, Any], not_compared: FragpruneError | None
-) -> str:
+def _describe(summary: launch.RunSummary, data: dict[str, Any]) -> str:
     if summary.already_finished:
         return (
             f"{summary.model_after} is finished: stage 2 with these settings wrote it before, and "
@@ -263,8 +261,8 @@ def _describe(
             lines.append(_CONTROL)
         if summary.fragments_before and summary.fragments_after:
             lines.append(wording.outcome_in_training(data))
-        if not_compared:
-            why = f"{not_compared.where}: {not_compared.found}. {not_compared.remedy}"
+        if data["not_compared"]:
+            why = "{where}: {found}. {remedy}".format(**data["not_compared"])
             lines.append(f"Not compared on held-out views because of {why}")
     pressure = f" at pressure {summary.curves[-1]['pressure']:.2g}" if summary.curves else ""
     learned = "of the control" if control else _WHERE.get(summary.stage, "of stage 2")

@@ -1,10 +1,8 @@
-"""Cameras without their photographs: of a file, or of a scene folder.
+"""Cameras without their photographs: of a scene folder, or of one of three kinds of file.
 
-Three kinds of file: the ``cameras.json`` a host writes beside its model (a list of ``id, img_name,
-width, height, position, rotation, fx, fy``; rotation is camera to world, principal point centred),
-a transforms file, which needs ``w`` and ``h`` where its images are absent, and the
-``camera_path.json`` that nerfstudio's viewer saves (``camera_to_world`` of 16 numbers in OpenGL's
-axes, ``fov`` of the height in degrees).
+These are the ``cameras.json`` a host writes beside its model (rotation is camera to world, the
+principal point centred), a transforms file, and the ``camera_path.json`` that nerfstudio's viewer
+saves (``camera_to_world`` of 16 numbers in OpenGL's axes, ``fov`` of the height in degrees).
 """
 
 from __future__ import annotations
@@ -49,11 +47,15 @@ def load_cameras(path: str | Path, *, white_background: bool = False) -> list[tu
         with _CAMERAS.stated(path) as reading:
             if (kind := content.get("camera_type", "perspective")) != "perspective":
                 raise ValueError(f"a path of {str(kind)[:40]!r} cameras, where we draw perspective")
-            size = int(content["render_width"]), int(content["render_height"])
+            width, height = int(content["render_width"]), int(content["render_height"])
             cameras = []
             for number, entry in enumerate(content["camera_path"]):
                 reading.place = f"camera_path[{number}]"
-                cameras.append((f"{number:05d}", _of_path(entry, *size)))
+                pose = [entry["camera_to_world"][at : at + 4] for at in (0, 4, 8)]
+                focal = height / (2 * math.tan(math.radians(float(entry["fov"])) / 2))
+                lens = focal, focal, width / 2, height / 2
+                camera = Camera(*opengl_pose(matrix(pose, (3, 4))), width, height, *lens)
+                cameras.append((f"{number:05d}", camera))
     elif isinstance(content, dict):
         cameras = [(row.name, row.camera) for row in read_transforms(path)]
     else:
@@ -87,12 +89,6 @@ def divided(views: list[tuple[str, View]], by: int) -> list[tuple[str, View]]:
         (name, replace(view, width=width, height=height))
         for (name, view), (width, height) in zip(views, sizes, strict=True)
     ]
-
-
-def _of_path(entry: dict[str, Any], width: int, height: int) -> Camera:
-    pose = matrix([entry["camera_to_world"][at : at + 4] for at in (0, 4, 8)], (3, 4))
-    focal = height / (2 * math.tan(math.radians(float(entry["fov"])) / 2))
-    return Camera(*opengl_pose(pose), width, height, focal, focal, width / 2, height / 2)
 
 
 def _camera(entry: dict[str, Any]) -> Camera:

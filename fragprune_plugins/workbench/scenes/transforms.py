@@ -62,7 +62,7 @@ def read(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]
             for keys in (("train_filenames",), ("test_filenames", "val_filenames"))
         )
         files = [_listed(frame["file_path"]) for frame in content["frames"]]
-    named = [(row, file) for row, file in zip(rows, files, strict=True)]
+    named = list(zip(rows, files, strict=True))
     wanted = [row for row, file in named if file not in held and (not kept or file in kept)]
     if held:
         return wanted, [row for row, file in named if file in held]

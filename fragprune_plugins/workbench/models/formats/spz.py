@@ -80,8 +80,26 @@ def read(reading: Reading) -> Model:
     if unknown := records.keys() - {CUTOFFS, STOP, SOFT, _COORDINATES}:
         named = ", ".join(f"{each:#010x}" for each in sorted(unknown)[:_NAMED])
         arrays.log.warning("SPZ: skipped %d extension(s): %s", len(unknown), named)
-    splat = _splat(header, parts, records.get(CUTOFFS), records.get(STOP))
-    splat = splat.with_rules(rim="soft") if SOFT in records else splat
+    count, codes, stop = header.count, records.get(CUTOFFS), records.get(STOP)
+    if codes is not None and len(codes) != count:
+        raise ValueError(f"{len(codes)} thresholds for {count} Gaussians")
+    positions, alphas, colours, scales, rotations, sh = (
+        np.frombuffer(part, np.uint8).reshape(count, -1) for part in parts
+    )
+    b = positions.reshape(count, 3, 3).astype(np.int32)
+    fixed = b[..., 0] | b[..., 1] << 8 | b[..., 2] << 16
+    fixed -= (fixed & 0x800000) << 1
+    splat = arrays.splat_of(
+        xyz=fixed / np.float32(1 << header.bits),
+        colours=(colours / 255 - 0.5) / _COLOUR_SCALE,
+        rest=((sh.astype(np.float32) - 128) / 128).reshape(count, -1, 3),
+        opacities=alphas[:, 0] / 255,
+        log_scales=scales / 16 - 10,
+        rotations=_first_three(rotations) if header.version == 2 else _smallest_three(rotations),
+        thresholds=None if codes is None else arrays.of_codes(np.frombuffer(codes, np.uint8)),
+        stop=None if stop is None else float(f"{struct.unpack('<f', stop)[0]:.6g}"),  # as written
+        rim="soft" if SOFT in records else "hard",
+    )
     return arrays.turned(splat, _axes(records.get(_COORDINATES)))
 
 
@@ -144,28 +162,6 @@ def _axes(payload: bytes | None) -> tuple[int, int, int]:
     differ = (system - 1) ^ (_RDF - 1)
     x, y, z = (-1 if differ >> bit & 1 else 1 for bit in range(3))
     return x, y, z
-
-
-def _splat(header: _Header, parts: list[bytes], codes: bytes | None, stop: bytes | None) -> Model:
-    count = header.count
-    if codes is not None and len(codes) != count:
-        raise ValueError(f"{len(codes)} thresholds for {count} Gaussians")
-    positions, alphas, colours, scales, rotations, sh = (
-        np.frombuffer(part, np.uint8).reshape(count, -1) for part in parts
-    )
-    b = positions.reshape(count, 3, 3).astype(np.int32)
-    fixed = b[..., 0] | b[..., 1] << 8 | b[..., 2] << 16
-    fixed -= (fixed & 0x800000) << 1
-    return arrays.splat_of(
-        xyz=fixed / np.float32(1 << header.bits),
-        colours=(colours / 255 - 0.5) / _COLOUR_SCALE,
-        rest=((sh.astype(np.float32) - 128) / 128).reshape(count, -1, 3),
-        opacities=alphas[:, 0] / 255,
-        log_scales=scales / 16 - 10,
-        rotations=_first_three(rotations) if header.version == 2 else _smallest_three(rotations),
-        thresholds=None if codes is None else arrays.of_codes(np.frombuffer(codes, np.uint8)),
-        stop=None if stop is None else float(f"{struct.unpack('<f', stop)[0]:.6g}"),  # as written
-    )
 
 
 def _first_three(data: arrays.Bytes) -> npt.NDArray[Any]:
