@@ -258,9 +258,7 @@ def _plain_view(width: int, height: int, background: tuple[float, float, float])
     )
 
 
-def _placements(
-    generator: torch.Generator, n: int, width: int, height: int
-) -> tuple[Tensor, Tensor]:
+def _placements(generator: torch.Generator, n: int, width: int, height: int) -> tuple[Tensor, ...]:
     """Pixels (N, 2) and view depths (N,): most inside, some on tile borders, outside, behind."""
     size = torch.tensor([width, height], dtype=torch.float64)
     pixels = _uniform(generator, -0.05, 1.05, n, 2) * size
@@ -307,9 +305,7 @@ def blended(view: View, splats: Splats, values: Tensor) -> Tensor:
     """(1, H, W): a number of each Gaussian (N,) blended as a colour, by the oracle in float64."""
 
     def double(thing: Any, **changes: Any) -> Any:
-        held = {
-            k: each.detach().double() for k, each in vars(thing).items() if torch.is_tensor(each)
-        }
+        held = {k: t.detach().double() for k, t in vars(thing).items() if torch.is_tensor(t)}
         return replace(thing, **held | changes)
 
     camera = double(view, background=torch.zeros(3, dtype=torch.float64))

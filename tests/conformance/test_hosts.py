@@ -78,9 +78,7 @@ OURS = {path.stem for path in Path(__file__).parents[1].iterdir()}
 def test_a_miniature_imports_nothing_of_ours(host, tmp_path):
     """It is a program of its own, as a checkout is."""
     HOSTS[host]().write(tmp_path)
-    nodes = [
-        each for file in tmp_path.rglob("*.py") for each in ast.walk(ast.parse(file.read_text()))
-    ]
+    nodes = [x for file in tmp_path.rglob("*.py") for x in ast.walk(ast.parse(file.read_text()))]
     names = [a.name for node in nodes if isinstance(node, ast.Import) for a in node.names]
     names += [node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)]
     imported = {name.split(".")[0] for name in names}

@@ -746,11 +746,7 @@ REFUSED = [
     (LOOP, f"    mp.Process(name=n, target=train).start()\n{LOOP}", "processes of its own"),
     ("from scene", "import jittor\nfrom scene", "train.py trains by jittor"),
     ("gaussians.oneupSHdegree()", CLAMPS, "changes _opacity outside"),
-    (
-        STEPS,
-        f"        if iteration < 9:\n    {STEPS}",
-        "its optimizer steps only where iteration < 9",
-    ),
+    (STEPS, f"        if iteration < 9:\n    {STEPS}", "optimizer steps only where iteration < 9"),
     ("projmatrix=0", "projmatrix=view.intrinsics", "is view.intrinsics"),
     (STATEMENT, "gaussians.prune(mask)", "calls prune, which its model lacks (train.py:"),
     ("if iteration < opt", f"rows = {STATEMENT}\n        if opt", "reads what thin_out"),
@@ -998,10 +994,7 @@ NOISE = {
     "the rate itself": ("noise = rate * torch.randn(9, 3)", True),
     "with an offset": ("noise = rate + torch.randn(9, 3)", False),
     "of another rate": ("noise = torch.randn(9, 3) * opt.rate", False),
-    "or another": (
-        "noise = rate * a\n        noise = b if late else noise\n        noise = b",
-        False,
-    ),
+    "or new": ("noise = rate * a\n        noise = b if late else noise\n        noise = b", False),
 }
 
 

@@ -187,9 +187,7 @@ def shared_data() -> Path | None:
 @pytest.mark.parametrize("scene", ["fox/{}160", "textured_room/{}"])
 def test_both_layouts_of_a_real_scene_agree(scene):
     folder = shared_data()
-    colmap, blender = (
-        load_dataset(folder / scene.format(layout)) for layout in ("colmap", "blender")
-    )
+    colmap, blender = (load_dataset(folder / scene.format(k)) for k in ("colmap", "blender"))
     for first, second in ((colmap.train, blender.train), (colmap.test, blender.test)):
         second = sorted(second, key=lambda shot: shot.name)
         assert stems(first) == [shot.name for shot in second]

@@ -67,10 +67,7 @@ def warming_up(patch):
         (Settings(iterations=STEPS), warming_up),
         (Settings(iterations=STEPS, goal=Faster(1.2)), tiny.exact_clock),
     ],
-    ids=[
-        *("all", "opacity", "dropout", "target", "control", "portable"),
-        *("warm-up", "target time"),
-    ],
+    ids=["all", "opacity", "dropout", "target", "control", "portable", "warm-up", "target time"],
 )
 def test_cut_off_it_ends_as_never_cut(model, dataset, tmp_path, monkeypatch, settings, prepare):
     if prepare:

@@ -52,9 +52,7 @@ class CountingDevice(EmulatedDevice):
     def _compile(self, path: Path, *text: str) -> None:
         seen = path.with_suffix(".o")
         self._build(seen, "-c", "-fsanitize=thread", "-fno-tree-sra", *text)
-        parts = (
-            self._part(source) for source in (EMULATION / "emulation.cpp", HERE / "traffic.cpp")
-        )
+        parts = (self._part(s) for s in (EMULATION / "emulation.cpp", HERE / "traffic.cpp"))
         self._build(path, "-shared", *parts, str(seen))
 
 

@@ -107,9 +107,7 @@ def brute(params, K, viewmat, *, antialiased: bool = False):
             alpha = opacities[i] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
             alpha = torch.where(alpha < 1 / 255, 0.0, alpha.clamp_max(0.999))
             for at, axis in ((x, 0), (y, 1)):  # tiles of 16 pixels, whole ones
-                first, last = (
-                    (means2d[0, i, axis] + side * radii[i, axis]) / 16 for side in (-1, 1)
-                )
+                first, last = ((means2d[0, i, axis] + s * radii[i, axis]) / 16 for s in (-1, 1))
                 alpha = torch.where(
                     (at >= first.floor() * 16) & (at < last.ceil() * 16), alpha, 0.0
                 )
@@ -481,9 +479,7 @@ def documented(folder: str, words: list[str]) -> str:
 def test_the_documented_loop_runs_and_exports_thresholds(folder, photographs, tmp_path, strategy):
     def loop(*words: object) -> None:
         words = (LOOP, photographs, *words, "--strategy", strategy)
-        assert "fragments per pixel" in fresh(
-            documented, str(folder), [str(word) for word in words]
-        )
+        assert "fragments per pixel" in fresh(documented, str(folder), [str(w) for w in words])
 
     loop(tmp_path, "--steps", 6, "--stage2", 6)
     before, after = (read_ply(tmp_path / f"{name}.ply") for name in ("trained", "finetuned"))

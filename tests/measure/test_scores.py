@@ -14,9 +14,7 @@ from fragprune_plugins.errors import InputError
 from fragprune_plugins.workbench import pruning as scores
 
 COUNT = 20
-VIEWS = [
-    replace(camera.view(), background=torch.tensor([0.2, 0.5, 0.9])) for camera in tiny.cameras(3)
-]
+VIEWS = [replace(c.view(), background=torch.tensor([0.2, 0.5, 0.9])) for c in tiny.cameras(3)]
 
 
 def scene(truncated):

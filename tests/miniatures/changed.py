@@ -31,9 +31,7 @@ class ForkHost(Host):
         """Write the fork into an empty folder."""
         super().write(root)
         model, train = root / MODEL, root / "train.py"
-        comprehension = next(
-            each for each in model.read_text().splitlines() if "groups = [{" in each
-        )
+        comprehension = next(x for x in model.read_text().splitlines() if "groups = [{" in x)
         edit(model, f"{comprehension}\n", GROUPS.removeprefix("\n"))
         edit(root / RENDERER, "image, radii = ", "image, depth, radii, touched = ")
         edit(root / RENDERER, '        "radii": radii,\n', RETURNED)

@@ -26,9 +26,7 @@ TINY = [
 ]
 """Flags with which a run of a few dozen iterations densifies and prunes."""
 
-OPTIONS = RunOptions(
-    device="cpu", settings=Settings(iterations=8, threshold_lr=0.3, train="opacity")
-)
+OPTIONS = RunOptions(device="cpu", settings=Settings(8, threshold_lr=0.3, train="opacity"))
 FROZEN = ("xyz", "f_dc", "f_rest", "scaling", "rotation")
 
 

@@ -77,9 +77,7 @@ def test_several_wraps_of_one_function_come_off_in_reverse(host):
     original, order = host.render, []
     ledger = PatchLedger()
     for name in "ab":
-        ledger.wrap(
-            seam("render"), lambda w, i, a, k, name=name: (order.append(name), w(*a, **k))[1]
-        )
+        ledger.wrap(seam("render"), lambda w, i, a, k, n=name: (order.append(n), w(*a, **k))[1])
     host.render(1, 2)
     assert order == ["b", "a"]
     assert ledger.undo() == []
