@@ -81,9 +81,7 @@ def flattened(splats: Splats) -> Splats:
     return replace(splats, scales=splats.scales[:, :2].clone())
 
 
-def random_thresholds(
-    seed: int, n: int, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
-) -> Tensor:
+def random_thresholds(seed, n, *, dtype=torch.float32, device="cpu"):
     """(N,) thresholds, log-uniform in 0.001 to 0.7; of each eight one neutral, one near 1."""
     generator = torch.Generator().manual_seed(seed)
     tau = _uniform(generator, math.log(1e-3), math.log(0.7), n).exp()
@@ -130,9 +128,7 @@ def one_splat(
     return cast(RasterInputs(view=view, splats=splats), dtype)
 
 
-def stack(
-    opacities: list[float], *, dtype: torch.dtype = torch.float32, width: int = 17, height: int = 17
-) -> RasterInputs:
+def stack(opacities, *, dtype=torch.float32, width=17, height=17):
     """Splats behind one another at the image's centre, first in front: for transmittance."""
     layers = [
         one_splat(
@@ -158,9 +154,7 @@ def behind_camera(*, dtype: torch.dtype = torch.float32) -> RasterInputs:
     return cast(replace(scene, splats=replace(splats, means=means)), dtype)
 
 
-def empty(
-    width: int = 20, height: int = 18, *, sh_degree: int = 1, dtype: torch.dtype = torch.float32
-) -> RasterInputs:
+def empty(width=20, height=18, *, sh_degree=1, dtype=torch.float32):
     """A scene of no Gaussians at all over a coloured background."""
     return random_scene(0, 0, width, height, sh_degree=sh_degree, dtype=dtype)
 
@@ -187,9 +181,7 @@ def leaves(inputs: RasterInputs) -> tuple[RasterInputs, dict[str, Tensor]]:
     return made, {**splats, "background": background, "means2d_hook": hook}
 
 
-def cast(
-    inputs: RasterInputs, dtype: torch.dtype, device: torch.device | str = "cpu"
-) -> RasterInputs:
+def cast(inputs, dtype, device="cpu"):
     """The same inputs in another dtype, on another device."""
 
     def convert(value: View | Splats | Footprints | RasterInputs) -> dict[str, Any]:

@@ -133,9 +133,7 @@ class Tab:
 
 
 @contextmanager
-def opened(
-    browser: Any, address: str, *, width: int = 1280, height: int = 720, **context: Any
-) -> Iterator[Tab]:
+def opened(browser, address, *, width=1280, height=720, **context):
     """Open a page that gets nothing from anywhere but its own origin, in CSS pixels.
 
     ``context`` goes to playwright's ``new_context``, as ``color_scheme="dark"``.

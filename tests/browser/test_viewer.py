@@ -64,9 +64,7 @@ def test_the_picture_is_our_engines(browser, tmp_path, degree):
         assert tab.errors == tab.strangers == []
 
 
-def boxes(
-    model: Model, view: View, *, truncated: bool, large: float
-) -> tuple[np.ndarray, np.ndarray]:
+def boxes(model, view, *, truncated, large):
     """(H, W) counts of shapes around ellipses, and of ellipses, over pixel centres.
 
     Shapes are boxes, or octagons around ellipses of more than ``large`` square pixels.

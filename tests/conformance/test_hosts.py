@@ -9,7 +9,7 @@ from installed.gsplat_host import GsplatHost
 from miniatures.hosts import HOSTS
 from miniatures.rt_4dgs import PythonHost, RigidHost
 
-from fragprune_plugins.testing import AdapterConformance, Host
+from fragprune_plugins.testing import AdapterConformance
 from fragprune_plugins.testing.plugin import NOT_APPLICABLE
 
 
@@ -46,9 +46,7 @@ class TestFork(RelativeConformance):
         pytest.skip(f"{NOT_APPLICABLE}it reads signatures: what it refuses, core/test_forks says")
 
 
-def relative(
-    adapter: str, host: type[Host] | None = None, **options: object
-) -> type[RelativeConformance]:
+def relative(adapter, host=None, **options):
     """The tests of an adapter whose host shares its patches with one above."""
     stated = {"adapter": adapter, "host": host or HOSTS[adapter]} | options
     return type("Relative", (RelativeConformance,), stated)

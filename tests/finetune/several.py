@@ -160,9 +160,7 @@ def lose_nan(ranks: Any) -> None:
     loop.photometric_loss = loss  # type: ignore[assignment]
 
 
-def command(
-    size: int, *words: object, prepare: Callable[[int], object] = lambda _: None
-) -> list[Ended]:
+def command(size, *words, prepare=lambda _: None):
     """The command line in each process after ``prepare(rank)``: exit code, stdout and stderr."""
 
     def one(rank: int) -> Any:

@@ -9,7 +9,6 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from unittest import mock
@@ -62,9 +61,7 @@ def library(compiler: str, kind: str) -> str | None:
 class GuardedArena(frame.Arena):
     """Has poisoned bytes between its arrays: AddressSanitizer knows the ends of tensors alone."""
 
-    def __init__(
-        self, where: torch.device, fill: Callable[..., torch.Tensor], **sizes: int
-    ) -> None:
+    def __init__(self, where, fill, **sizes):
         super().__init__(where, fill, **{k: size + 256 for k, size in sizes.items()})
         poison = getattr(ctypes.CDLL(None), "__asan_poison_memory_region")
         for name, size in sizes.items():

@@ -6,7 +6,6 @@ Proves what is packed and passed to the driver, and in which order; not that a G
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -96,9 +95,7 @@ else:
 
 
 @pytest.fixture(scope="module")
-def script(
-    device: EmulatedDevice, nvrtc: kernels.Nvrtc, tmp_path_factory: pytest.TempPathFactory
-) -> Callable[[str], str]:
+def script(device, nvrtc, tmp_path_factory):
     """Runs a script where libcuda is the stand-in; what it says."""
     if not sys.platform.startswith("linux"):
         pytest.skip("needs dlopen and ELF")

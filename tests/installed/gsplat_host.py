@@ -29,9 +29,7 @@ def releases() -> dict[str, Path]:
     return found
 
 
-def new_params(
-    count: int, *, seed: int = 0, degree: int = 1
-) -> tuple[torch.nn.ParameterDict, dict[str, torch.optim.Optimizer]]:
+def new_params(count, *, seed=0, degree=1):
     """(params, optimizers), as users of gsplat make them."""
     generator = torch.Generator().manual_seed(seed)
 

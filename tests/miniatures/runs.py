@@ -1,6 +1,5 @@
 """Whole runs of a miniature's own scripts, and what must not have moved in them."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -74,9 +73,7 @@ def check_stage_two(summary: Any, adapter: str) -> None:
     assert summary.fragments_after < summary.fragments_before
 
 
-def check_measured(
-    summary: Any, picture: Path, photographs: Path, read: Callable[[Path], Any]
-) -> None:
+def check_measured(summary, picture, photographs, read):
     """The picture of the one held-out view that a host's script rendered is what we measure."""
     values = sidecar.load(summary.model_after)[0].values.detach()
     candidate = Candidate(read(summary.model_after), summary.drawing)

@@ -1,13 +1,10 @@
 """The demo's host in this process, under the vanilla adapter unless told otherwise."""
 
 import signal
-from pathlib import Path
 from typing import Any
 
 import torch
 
-from fragprune_plugins.hosts.adapter import HostAdapter
-from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.testing import host as kit
 from fragprune_plugins.testing.host import MINIATURE as HOST
@@ -33,20 +30,12 @@ class InterruptAt:
         self.finished.append(summary)
 
 
-def running(
-    settings: Settings | None = None,
-    *,
-    path: Path = HOST,
-    adapter: HostAdapter | None = None,
-    **options: Any,
-) -> Any:
+def running(settings=None, *, path=HOST, adapter=None, **options):
     """The host, imported under a session (activated unless told otherwise)."""
     return kit.running(settings, adapter=adapter or Vanilla3DGS(), path=path, **options)
 
 
-def joint(
-    settings: Settings | None = None, *, adapter: HostAdapter | None = None, **options: Any
-) -> Any:
+def joint(settings=None, *, adapter=None, **options):
     """The host under a session that learns from the first step and freezes nothing."""
     return kit.joint(settings, adapter=adapter or Vanilla3DGS(), **options)
 

@@ -19,14 +19,12 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from fragprune_plugins.engines.cpu import binding
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
-    from fragprune_plugins.types import RasterInputs
+    pass
 
 STAGES = {
     "project": "fp::project_all(",
@@ -45,13 +43,7 @@ WANTS = {
 """Gradients by the name of a pass; with thresholds theirs are wanted, too."""
 
 
-def counts(
-    inputs: RasterInputs,
-    thresholds: Tensor | None,
-    *,
-    kind: str = "forward",
-    library: str | Path | None = None,
-) -> dict[str, float]:
+def counts(inputs, thresholds, *, kind="forward", library=None):
     """Instructions by stage of one frame, calls included; and `evaluated` and `drawn` per pixel.
 
     ``kind`` is one of ``WANTS``; the build is this installation's for AVX2 unless one is given.
@@ -137,9 +129,7 @@ def replay(path: Path) -> None:
     sys.stdout.write(f"{out.evaluated / pixels} {out.drawn / pixels}\n")
 
 
-def scene(
-    size: int, gaussians: int, falloff: float = 0.0, planes: Any = (), scale: float = 1.5
-) -> tuple[RasterInputs, Tensor | None]:
+def scene(size, gaussians, falloff=0.0, planes=(), scale=1.5):
     """The bench scene on a square picture, and one threshold for all; none at 0.
 
     At a scale of 1.5, 10,000 Gaussians draw over 20 fragments per pixel.

@@ -66,9 +66,7 @@ KINDS = {
 }
 
 
-def draw_pair(
-    engine: CpuEngine, inputs: RasterInputs, thresholds: torch.Tensor | None
-) -> tuple[RasterOutputs, RasterOutputs, torch.Tensor]:
+def draw_pair(engine, inputs, thresholds):
     """Both engines' outputs without gradients, and where their fragment counts agree, (H, W)."""
     truth = once(true_picture, inputs, thresholds)
     with torch.no_grad():
@@ -82,9 +80,7 @@ def true_picture(inputs: RasterInputs, thresholds: torch.Tensor | None) -> Raste
     return ReferenceEngine().rasterize(wide, None if thresholds is None else thresholds.double())
 
 
-def true_gradients(
-    inputs: RasterInputs, thresholds: torch.Tensor | None, same: torch.Tensor
-) -> dict[str, torch.Tensor]:
+def true_gradients(inputs, thresholds, same):
     tau = None if thresholds is None else thresholds.double()
     return gradients(ReferenceEngine(), scenes.cast(inputs, torch.float64), tau, same, 5.0)
 
@@ -109,12 +105,7 @@ def digest(value: Any) -> Any:
     return tuple(map(digest, value)) if isinstance(value, tuple) else value
 
 
-def check_images(
-    truth: RasterOutputs,
-    ours: RasterOutputs,
-    same: torch.Tensor,
-    tolerance: float = IMAGE_TOLERANCE,
-) -> None:
+def check_images(truth, ours, same, tolerance=IMAGE_TOLERANCE):
     assert (~same).sum() <= 1 + same.numel() // 500
     for name in ("image", "invdepth", "alpha", "features", "surface"):
         expected = getattr(truth, name)
@@ -141,13 +132,7 @@ def test_large_pictures_are_written_whole_past_the_caches(engine):
     check_images(*pair, tolerance=10 * IMAGE_TOLERANCE)
 
 
-def gradients(
-    engine: CpuEngine | ReferenceEngine,
-    inputs: RasterInputs,
-    thresholds: torch.Tensor | None,
-    same: torch.Tensor,
-    pressure: float,
-) -> dict[str, torch.Tensor]:
+def gradients(engine, inputs, thresholds, same, pressure):
     """Of one loss that uses every output, by leaf name."""
     made, leaves = scenes.leaves(inputs)
     if thresholds is not None:
@@ -166,13 +151,7 @@ def gradients(
     return {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
 
 
-def check_gradients(
-    engine: CpuEngine,
-    inputs: RasterInputs,
-    thresholds: torch.Tensor | None,
-    same: torch.Tensor,
-    tolerance: float = GRADIENT_TOLERANCE,
-) -> None:
+def check_gradients(engine, inputs, thresholds, same, tolerance=GRADIENT_TOLERANCE):
     truth = once(true_gradients, inputs, thresholds, same)
     ours = gradients(engine, inputs, thresholds, same, 5.0)
     for name, expected in truth.items():
@@ -312,9 +291,7 @@ def test_awkward_scenes_equal_the_oracle(engine, case):
 Drawn = tuple[RasterInputs, torch.Tensor | None]
 
 
-def placed(
-    scene: RasterInputs, pixels: torch.Tensor, depths: torch.Tensor, sigma: torch.Tensor
-) -> RasterInputs:
+def placed(scene, pixels, depths, sigma):
     """The same splats of a scene in float64, at other places and sigma pixels (N, 3) large."""
     view = scene.view
     scales = sigma * (depths.abs() * 2 * view.tan_fov_x / view.width)[:, None]

@@ -12,15 +12,13 @@ from torch import inf, nan
 
 from fragprune_plugins.constants import NEUTRAL_LOGIT
 from fragprune_plugins.engines.cpu.engine import CpuEngine
-from fragprune_plugins.types import RasterInputs, Rim
+from fragprune_plugins.types import Rim
 
 # Enough Gaussians and tiles for several pieces of work per thread, in sorting and binning too.
 LARGE = {"n": 20_000, "width": 150, "height": 100, "scale_modifier": 0.3}
 
 
-def everything(
-    engine: CpuEngine, inputs: RasterInputs, thresholds: torch.Tensor | None
-) -> dict[str, torch.Tensor]:
+def everything(engine, inputs, thresholds):
     """All outputs and all gradients of one loss."""
     made, leaves = scenes.leaves(replace(inputs, counts=True, scores=True))
     if thresholds is not None:

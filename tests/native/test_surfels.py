@@ -40,9 +40,7 @@ def sheet(seed: int) -> RasterInputs:
     return replace(scene, view=view, splats=splats)
 
 
-def slopes(
-    drawn: RasterOutputs, leaves: dict, plane: Callable[[RasterOutputs], torch.Tensor], same: object
-) -> dict[str, torch.Tensor]:
+def slopes(drawn, leaves, plane, same):
     """Derivatives of a sum over one plane, its pixels weighted at random, by leaf name."""
     weight = torch.randn(plane(drawn).shape, generator=torch.Generator().manual_seed(7)) * same
     (plane(drawn) * weight.to(drawn.image)).sum().backward()

@@ -153,9 +153,7 @@ def splats_of(inputs: RasterInputs, thresholds=None) -> list[Splat]:
     return sorted(found, key=lambda s: s.depth)
 
 
-def records_at(
-    splats: list[Splat], x: int, y: int, offset=(0.0, 0.0), stop=None
-) -> tuple[list[Record], float]:
+def records_at(splats, x, y, offset=(0.0, 0.0), stop=None):
     """The pairs visited at a pixel, in order, and the final transmittance."""
     records, light = [], 1.0
     for s in splats:

@@ -69,9 +69,7 @@ def after_runs(folder: Path, scene: Path) -> dict[str, tuple[int, list[str]]]:
     return {name: after_run(folder / str(i), scene, *RUNS[name]) for i, name in enumerate(RUNS)}
 
 
-def after_run(
-    folder: Path, scene: Path, stage: str, does: str, ends: type[FragpruneError] | None
-) -> tuple[int, list[str]]:
+def after_run(folder, scene, stage, does, ends):
     script, out = host_of(folder, does), folder / "out"
     words = command(script, scene, out, 12)
     options = RunOptions(

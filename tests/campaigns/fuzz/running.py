@@ -11,7 +11,6 @@ import time
 import warnings
 from collections import Counter
 from dataclasses import dataclass, field
-from multiprocessing.connection import Connection
 from pathlib import Path
 
 from campaigns.fuzz.mutate import mutated
@@ -137,9 +136,7 @@ def _child(reader: Reader, tally: Tally, numbers: range, seed: int, how: tuple[P
     return numbers.stop
 
 
-def _feed(
-    told: Connection, reader: Reader, numbers: range, seed: int, place: Path, end: float
-) -> None:
+def _feed(told, reader, numbers, seed, place, end):
     """In the child: one input after the other, until the last or until the time is up."""
     warnings.simplefilter("ignore")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)

@@ -63,9 +63,7 @@ class Toolchain:
             assert done.returncode == 0, done.stderr[-4000:]
         return made
 
-    def tally(
-        self, source: str, build: str, sanitizers: tuple[str, ...], *words: object
-    ) -> dict[str, int]:
+    def tally(self, source, build, sanitizers, *words):
         """What such a program prints in the end; skips where none with these sanitizers runs."""
         before = wrapper(self, sanitizers)
         program = self.program(source, build, sanitizers)
