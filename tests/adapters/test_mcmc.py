@@ -2,7 +2,6 @@
 
 import json
 
-import pytest
 import torch
 from miniatures import runs
 from miniatures.mcmc import MCMCHost
@@ -10,7 +9,6 @@ from miniatures.runs import OPTIONS, miniature
 from miniatures.vanilla_3dgs import joint
 
 from fragprune_mcmc import MCMC
-from fragprune_plugins.errors import UsageError
 from fragprune_plugins.injection.launch import run
 
 COUNT = 24
@@ -47,12 +45,3 @@ def test_what_stage_two_changes_wins_over_the_configuration_file(mini, photograp
     assert summary.model_after == out / "point_cloud" / "iteration_21" / "point_cloud.ply"
     assert 150 < summary.gaussians <= 170
     assert json.loads(config.read_text()) == values
-
-
-@pytest.mark.parametrize("text", [None, "{"], ids=["missing", "broken"])
-def test_a_configuration_file_that_cannot_be_read_is_refused(mini, photographs, tmp_path, text):
-    config = tmp_path / "scene.json"
-    if text:
-        config.write_text(text)
-    with pytest.raises(UsageError, match="a file the host can read"):
-        run(command(mini, photographs, tmp_path / "out", 12, "--config", config), OPTIONS)

@@ -100,30 +100,6 @@ def test_features_without_a_gradient_from_above_get_zeros(engine):
     assert leaves["means"].grad.any()
 
 
-@pytest.mark.parametrize("kind", [{}, {"compensation": "mip"}, {"features": 2, "offsets": True}])
-def test_footprints_draw_and_learn_what_the_splats_do(engine, kind):
-    """Projected in torch, drawn by the engine, and back through both."""
-    inputs = scenes.random_scene(2, **kind, absolute_gradient=True)
-    thresholds = scenes.random_thresholds(2, 60)
-    whole = engine.rasterize(replace(inputs, counts=True), thresholds)
-    found = []
-    for case in (inputs, scenes.cast(inputs, torch.float64)):
-        made, leaves = scenes.leaves(case)
-        leaves["thresholds"] = tau = thresholds.to(case.view.background).clone().requires_grad_()
-        projected = made if case is inputs else scenes.footprints_of(made)
-        out = engine.rasterize(replace(projected, counts=True), tau)
-        same = whole.fragments == out.fragments
-        assert (~same).sum() <= 2
-        picture = torch.cat([out.image, out.invdepth, out.alpha])
-        weights = torch.rand(picture.shape, generator=torch.Generator().manual_seed(1)) - 0.3
-        (picture * weights * same).sum().backward()
-        found.append({name: leaf.grad for name, leaf in leaves.items()})
-    for name, expected in found[0].items():
-        if expected is not None:
-            scale = expected.abs().max().item() + 1e-3
-            assert (found[1][name] - expected).abs().max().item() < 1e-3 * scale, name
-
-
 def test_footprints_that_cannot_be_drawn_are_culled(engine):
     scene = scenes.footprints_of(scenes.stack([0.5] * 9))
     splats = scene.splats
