@@ -93,9 +93,7 @@ def test_stage_two_begins_with_what_is_kept(alone, host, script, more, photograp
     summary = run(words, replace(OPTIONS, look=look, stage="finetune" if alone else "auto"))
     ((shown, _, drawing, _),) = look.seen
     assert (shown, drawing) == (summary.model_before, summary.drawing)
-    before, after = (
-        load(ply, filtered=True) for ply in (summary.model_before, summary.model_after)
-    )
+    before, after = (load(p, filtered=True) for p in (summary.model_before, summary.model_after))
     for name in FROZEN:
         assert torch.equal(getattr(after, name), getattr(before, name)[::2]), name
     store, info = sidecar.load(summary.model_after)

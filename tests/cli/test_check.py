@@ -235,11 +235,7 @@ def test_several_checkouts_are_a_table(tmp_path):
     hosts = [tmp_path / name for name in ("a", "b", "empty")]
     result = run("check", *hosts)
     rows = [line.split(" | ") for line in result.stdout.splitlines() if line.startswith("| ")][1:]
-    assert [(row[0], row[1]) for row in rows] == [
-        ("| a", "fits"),
-        ("| b", "never"),
-        ("| empty", "never"),
-    ]
+    assert [(r[0], r[1]) for r in rows] == [("| a", "fits"), ("| b", "never"), ("| empty", "never")]
     assert "further groups of the optimizer: color" in rows[1][-1]
     counts = json.loads(run("check", *hosts, "--json").stdout)["counts"]
     assert (counts["fits"], counts["never"]) == (1, 2)

@@ -113,9 +113,7 @@ def inherited(call: Any) -> Iterator[RowTrace]:
 class LetsMomentsBeInherited(MCMC):
     """Gives copies their parents' moments."""
 
-    seams = tuple(
-        replace(seam, how=inherited) if seam.role is Role.REARRANGE else seam for seam in MCMC.seams
-    )
+    seams = tuple(replace(s, how=inherited) if s.role is Role.REARRANGE else s for s in MCMC.seams)
 
 
 class SavesNothing(Vanilla3DGS):
@@ -223,7 +221,4 @@ def littered(call: Any) -> Iterator[RowTrace]:
 class LeavesItsRowNumbers(Gsplat):
     """Leaves its row numbers in the user's model."""
 
-    seams = tuple(
-        replace(seam, how=littered) if seam.role is Role.REARRANGE else seam
-        for seam in Gsplat.seams
-    )
+    seams = tuple(replace(s, how=littered) if s.role is Role.REARRANGE else s for s in Gsplat.seams)

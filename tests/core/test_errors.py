@@ -4,11 +4,7 @@ from fragprune_plugins import errors
 from fragprune_plugins.errors import FragpruneError
 from fragprune_plugins.hosts.findings import Finding
 
-KINDS = [
-    kind
-    for kind in vars(errors).values()
-    if isinstance(kind, type) and issubclass(kind, FragpruneError)
-]
+KINDS = [k for k in vars(errors).values() if isinstance(k, type) and issubclass(k, FragpruneError)]
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)

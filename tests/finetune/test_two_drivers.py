@@ -123,9 +123,7 @@ def test_both_drivers_learn_the_same_to_the_bit(case, tmp_path, plug):
     assert result.progress.steps == summary.steps == settings.iterations
     if settings.goal.presses:
         assert store.steps > 0
-        assert [vars(SimpleNamespace(**point)) for point in curves] == [
-            vars(point) for point in result.curves
-        ]
+        assert [vars(SimpleNamespace(**p)) for p in curves] == [vars(p) for p in result.curves]
         assert result.progress.fragments_before == summary.fragments_before
         assert result.progress.fragments_after == summary.fragments_after
         assert result.progress.target_reached == summary.target_reached

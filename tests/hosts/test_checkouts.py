@@ -103,12 +103,7 @@ def need(*packages):
 
 @pytest.mark.parametrize(
     ("host", "training"),
-    [
-        case
-        for name, trainings in TRAININGS.items()
-        for training in trainings
-        for case in each_of(name, training)
-    ],
+    [case for name, trainings in TRAININGS.items() for t in trainings for case in each_of(name, t)],
 )
 def test_training_then_fine_tuning(host, training, dataset, tmp_path):
     need(*training.needs)

@@ -79,9 +79,7 @@ def color_of(splats, row, campos):
     orders = [(d, m) for d in range(splats.sh_degree + 1) for m in range(-d, d + 1)]
     basis = [harmonic(d, m, direction) for d, m in orders]
     sh = splats.sh[row].tolist()
-    return [
-        max(0.0, 0.5 + sum(b * sh[k][channel] for k, b in enumerate(basis))) for channel in range(3)
-    ]
+    return [max(0.0, 0.5 + sum(b * sh[k][c] for k, b in enumerate(basis))) for c in range(3)]
 
 
 def covariance_3d(splats, row, modifier):
