@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import logging
 from importlib import import_module
 from typing import TYPE_CHECKING, Protocol
 
+from fragprune_plugins.constants import log
 from fragprune_plugins.errors import EngineError, UsageError
 
 if TYPE_CHECKING:
@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from fragprune_plugins.types import RasterInputs, RasterOutputs
-
-log = logging.getLogger("fragprune")
 
 ENGINES = {
     "reference": "reference:ReferenceEngine",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
@@ -22,6 +23,12 @@ Wanted = frozenset[str]
 _COMPENSATIONS: Final = get_args(Compensation)
 """In the order of enum fragprune_compensation."""
 
+_SCALARS: Final = (
+    *("width", "height", "tan_fov_x", "tan_fov_y", "scale_modifier", "dilation", "near"),
+    *("alpha_max", "cap_gradient", "absolute_gradient"),
+)
+"""Of fragprune_inputs: those of a view and of ``RasterInputs`` that have the same names there."""
+
 SMALL = 1 << 16
 """Bytes below which the C library has memory at hand itself."""
 
@@ -31,11 +38,6 @@ def plain(
 ) -> Tensor:
     """The tensor's values, contiguous on a device, as 4-byte numbers."""
     return tensor.detach().to(where, dtype).contiguous()
-
-
-def address(tensor: Tensor | None) -> int | None:
-    """The address of a tensor's first number; None for no tensor or an empty one."""
-    return None if tensor is None or tensor.numel() == 0 else tensor.data_ptr()
 
 
 def empty(workspace: binding.Workspace, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -49,13 +51,19 @@ def empty(workspace: binding.Workspace, *shape: int, dtype: torch.dtype = torch.
     return torch.frombuffer(workspace.take(size), dtype=dtype).view(shape)
 
 
-def expect_ok(status: int, error: binding.Error) -> None:
-    """Raise what a call's status says.
+def run(library: binding.Library, function: str, *arguments: Any) -> None:
+    """Call a function of the C interface, structs by reference.
 
     Raises:
         MemoryError: there is not enough memory.
         EngineError: the inputs were refused.
     """
+    error = binding.Error()
+    passed = (
+        ctypes.byref(each) if isinstance(each, ctypes.Structure) else each
+        for each in (*arguments, error)
+    )
+    status = getattr(library.calls, f"fragprune_{function}")(*passed)
     if status == binding.OK:
         return
     text = error.message.decode(errors="replace")
@@ -97,21 +105,12 @@ def native_inputs(
         arrays: the result of ``native_arrays``.
         widen: thresholds will want a gradient.
     """
-    view, splats = inputs.view, inputs.splats
+    splats, given = inputs.splats, vars(inputs.view) | vars(inputs)
     return binding.Inputs(
+        **{name: given[name] for name in _SCALARS},
         threads=threads,
-        width=view.width,
-        height=view.height,
-        tan_fov_x=view.tan_fov_x,
-        tan_fov_y=view.tan_fov_y,
-        scale_modifier=inputs.scale_modifier,
-        dilation=inputs.dilation,
-        near=inputs.near,
-        alpha_max=inputs.alpha_max,
         stop=inputs.stop or 0.0,
         compensation=_COMPENSATIONS.index(inputs.compensation),
-        cap_gradient=inputs.cap_gradient,
-        absolute_gradient=inputs.absolute_gradient,
         sh_degree=splats.sh_degree if isinstance(splats, Splats) else 0,
         sh_coefficients=sum(_second_length(arrays.get(name)) for name in ("sh", "sh_rest")),
         feature_count=_second_length(arrays.get("features")),
@@ -121,7 +120,7 @@ def native_inputs(
         count=len(splats),
         lengths=binding.Lengths(**{name: array.numel() for name, array in arrays.items()}),
         workspace=workspace,
-        **{name: address(array) for name, array in arrays.items()},
+        **arrays,
     )
 
 

@@ -2,21 +2,12 @@
 
 from __future__ import annotations
 
-import ctypes
 from functools import cache
 
 import torch
 from torch import Tensor
 
-from fragprune_plugins.engines.calling import (
-    Wanted,
-    address,
-    empty,
-    expect_ok,
-    in_graph,
-    native_threads,
-    plain,
-)
+from fragprune_plugins.engines.calling import Wanted, empty, in_graph, native_threads, plain, run
 from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.errors import InputError
 from fragprune_plugins.types import short
@@ -67,14 +58,12 @@ def compiled_loss(
             width=width,
             l1_weight=1 - ssim_weight,
             ssim_weight=ssim_weight,
-            image=address(x),
-            target=address(y),
-            gradient=address(gradients[0]) if gradients else None,
+            image=x,
+            target=y,
+            gradient=gradients[0] if gradients else None,
             workspace=workspace.handle,
         )
-        error = binding.Error()
-        call = opened.calls.fragprune_photometric_loss
-        expect_ok(call(ctypes.byref(images), ctypes.byref(error)), error)
+        run(opened, "photometric_loss", images)
         value = (1 - ssim_weight) * images.l1 + ssim_weight * images.dissimilarity
         return {"loss": x.new_tensor(value)}
 

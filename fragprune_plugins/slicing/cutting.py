@@ -6,7 +6,6 @@ itself, ``SliceKernels``. Between the two passes only the inputs are kept.
 
 from __future__ import annotations
 
-import ctypes
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any, Literal
@@ -14,15 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 
 from fragprune_plugins.engines import create_engine
-from fragprune_plugins.engines.calling import (
-    Wanted,
-    address,
-    empty,
-    expect_ok,
-    in_graph,
-    native_threads,
-    plain,
-)
+from fragprune_plugins.engines.calling import Wanted, empty, in_graph, native_threads, plain, run
 from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.engines.cpu.engine import CpuEngine
 from fragprune_plugins.engines.cuda.engine import CudaEngine
@@ -81,13 +72,11 @@ def check_harmonics(splats: SpacetimeSplats, moment: Moment) -> None:
         return
     assert splats.sh is not None
     if splats.sh.shape[1] < 16 * (1 + orders) or splats.times is None:
-        raise InputError(
-            "SpacetimeSplats.sh",
-            f"{splats.sh.shape[1]} coefficients, times {'' if splats.times is not None else 'not '}"
-            "given",
-            f"times, and at least {16 * (1 + orders)} for {orders} cosines",
-            "Use fewer cosines or pass all coefficients.",
-        )
+        found = f"{splats.sh.shape[1]} coefficients, times "
+        found += f"{'' if splats.times is not None else 'not '}given"
+        expected = f"times, and at least {16 * (1 + orders)} for {orders} cosines"
+        remedy = "Use fewer cosines or pass all coefficients."
+        raise InputError("SpacetimeSplats.sh", found, expected, remedy)
 
 
 # ---- compiled code -----------------------------------------------------------------------------
@@ -111,10 +100,7 @@ class CpuKernels:
 
     def call(self, way: Way, *arguments: Any) -> None:
         """Cut, or go back: inputs, what was cut or its gradients, and gradients to fill."""
-        error = binding.Error()
-        passed = (each for each in (*arguments, error) if each is not None)
-        status = getattr(self.library.calls, f"fragprune_{way}")(*map(ctypes.byref, passed))
-        expect_ok(status, error)
+        run(self.library, way, *arguments)
 
 
 @dataclass(frozen=True)
@@ -130,7 +116,7 @@ class CudaKernels:
 
     def call(self, way: Way, given: structs.Spacetime, *others: Any) -> None:
         """Cut, or go back."""
-        passed = structs.Slicing(given, *(each for each in others if each is not None))
+        passed = structs.Slicing(given, *others)
         blocks = blocks_of(given.count)
         launch(self.device, self.where, "slice", structs.MACROS, f"fp_{way}", blocks, passed)
 
@@ -141,21 +127,15 @@ SliceKernels = CpuKernels | CudaKernels
 
 @cache
 def expect_right(device: Device, where: torch.device) -> None:
-    """Cut a few Gaussians on a GPU, once for each, and compare with the oracle.
-
-    Raises:
-        EngineError: values or gradients differ.
-    """
-    found = _some(lambda *given: slice_by(CudaKernels(device, where), *given), where, torch.float32)
+    """Cut a few Gaussians on a GPU, once for each, and compare with the oracle."""
+    cut = _some(lambda *given: slice_by(CudaKernels(device, where), *given), where, torch.float32)
     for name, right in _some(slice_by_oracle, torch.device("cpu"), torch.float64).items():
-        away, largest = (found[name] - right).abs().max(), right.abs().max()
+        away, largest = (cut[name] - right).abs().max(), right.abs().max()
         if not away <= 1e-3 * largest:
-            raise EngineError(
-                f"engine 'cuda' on {where}",
-                f"a cut in time whose {name} are off by {away:.2g}",
-                f"at most {1e-3 * largest:.2g}, a thousandth of the largest",
-                "Run on the CPU (--device cpu), and report this with the GPU's name.",
-            )
+            found = f"a cut in time whose {name} are off by {away:.2g}"
+            expected = f"at most {1e-3 * largest:.2g}, a thousandth of the largest"
+            remedy = "Run on the CPU (--device cpu), and report this with the GPU's name."
+            raise EngineError(f"engine 'cuda' on {where}", found, expected, remedy)
 
 
 def _some(cut: Any, where: torch.device, dtype: torch.dtype) -> dict[str, Tensor]:
@@ -205,19 +185,14 @@ def slice_by(kernels: SliceKernels, splats: SpacetimeSplats, moment: Moment) -> 
     held = {name: each for name, each in vars(splats).items() if isinstance(each, torch.Tensor)}
     read = {**held, "campos": moment.campos}
     arrays = {name: plain(each, kernels.where) for name, each in read.items()}
-    n, sh = len(splats), arrays.get("sh")
+    n, sh, orders = len(splats), arrays.get("sh"), moment.sh_degree_t
     given = structs.Spacetime(
+        **vars(moment) | arrays | {"sh_degree_t": -1 if orders is None else orders},
         threads=native_threads(),
-        timestamp=moment.timestamp,
-        duration=moment.duration,
-        prefilter_var=moment.prefilter_var,
-        scale_modifier=moment.scale_modifier,
         sh_degree=splats.sh_degree,
-        sh_degree_t=-1 if moment.sh_degree_t is None else moment.sh_degree_t,
         sh_coefficients=0 if sh is None else sh.shape[1],
         count=n,
         lengths=binding.Lengths(**{name: each.numel() for name, each in arrays.items()}),
-        **{name: address(each) for name, each in arrays.items()},
     )
     present = torch.empty(n, dtype=torch.bool, device=kernels.where)
 
@@ -225,20 +200,13 @@ def slice_by(kernels: SliceKernels, splats: SpacetimeSplats, moment: Moment) -> 
         made = {"means": (n, 3), "cov3d": (n, 6), "opacities": (n,)}
         made |= {} if sh is None else {"colors": (n, 3)}
         cut = {name: kernels.empty(*shape) for name, shape in made.items()} | {"present": present}
-        kernels.call(
-            "slice", given, structs.Sliced(**{k: address(each) for k, each in cut.items()})
-        )
+        kernels.call("slice", given, structs.Sliced(**cut))
         return cut
 
     def backward(wanted: Wanted, by: dict[str, Tensor]) -> dict[str, Tensor]:
         by = {name: plain(grad, kernels.where) for name, grad in by.items()} | {"present": present}
         grads = {name: kernels.empty(*arrays[name].shape) for name in wanted}
-        kernels.call(
-            "unslice",
-            given,
-            structs.Sliced(**{name: address(grad) for name, grad in by.items()}),
-            structs.SpacetimeGrads(**{name: address(grad) for name, grad in grads.items()}),
-        )
+        kernels.call("unslice", given, structs.Sliced(**by), structs.SpacetimeGrads(**grads))
         return grads
 
     cut = in_graph(held, forward, backward, _FELT_BY)

@@ -10,7 +10,8 @@ import spacetime
 import torch
 
 from fragprune_plugins.adapting import EngineError, Footprints, RasterInputs, Splats, View
-from fragprune_plugins.engines.calling import address, native_arrays, native_inputs
+from fragprune_plugins.engines.calling import native_arrays, native_inputs
+from fragprune_plugins.engines.cpu.binding import address
 from fragprune_plugins.engines.cpu.engine import CpuEngine, binding
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.slicing.cutting import Way, slice_by

@@ -38,17 +38,27 @@ class Error(ctypes.Structure):
     _fields_ = (("message", ctypes.c_char * 256),)
 
 
-class _Named(ctypes.Structure):
-    """A struct built from keyword arguments; fields that are not given are zero."""
+class Named(ctypes.Structure):
+    """A struct built from keyword arguments; fields that are not given are zero.
+
+    Tensors are given by their ``address``. Whoever makes the struct keeps them.
+    """
 
     def __init__(self, **fields: Any) -> None:
         unknown = fields.keys() - {name for name, *_ in self._fields_}
         if unknown:  # ctypes itself would set attributes that C never sees
             raise TypeError(f"{type(self).__name__} has no {', '.join(sorted(unknown))}")
-        super().__init__(**fields)
+        super().__init__(**{name: address(each) for name, each in fields.items()})
 
 
-class Sized(_Named):
+def address(value: Any) -> Any:
+    """Of a tensor the address of its first number, None if it is empty; another value as it is."""
+    if not hasattr(value, "data_ptr"):
+        return value
+    return value.data_ptr() if value.numel() else None
+
+
+class Sized(Named):
     """A struct whose first field is its own size."""
 
     def __init__(self, **fields: Any) -> None:
@@ -65,7 +75,7 @@ def pointers(names: str) -> tuple[tuple[str, Any], ...]:
     return several(_POINTER, names)
 
 
-class Lengths(_Named):
+class Lengths(Named):
     """fragprune_lengths."""
 
     _fields_ = (
@@ -169,11 +179,7 @@ def _path_of(build: str) -> str:
 
 
 def open_build(build: str) -> Library:
-    """Open one build and check the version of its interface.
-
-    Raises:
-        Unavailable: the build is absent, broken, or of another version.
-    """
+    """Open one build and check the version of its interface."""
     path = _path_of(build)
     try:
         calls = ctypes.CDLL(path)
@@ -251,11 +257,7 @@ def available() -> bool:
 
 
 def library() -> Library:
-    """The opened build.
-
-    Raises:
-        EngineError: there is none; the message gives the reason.
-    """
+    """The opened build."""
     answer = chosen()
     if isinstance(answer, Library):
         return answer
@@ -275,11 +277,7 @@ class Workspace:
         self.handle: int | None = opened.calls.fragprune_workspace_new()
 
     def take(self, size: int) -> ctypes.Array[ctypes.c_char]:
-        """A buffer of `size` bytes; its memory returns to the workspace with the last reference.
-
-        Raises:
-            MemoryError: there is not enough memory.
-        """
+        """A buffer of `size` bytes; its memory returns to the workspace with the last reference."""
         address = self._calls.fragprune_workspace_take(self.handle, size) if self.handle else None
         if address is None:
             raise MemoryError("fragprune's cpu engine: out of memory")

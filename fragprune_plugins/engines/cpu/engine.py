@@ -12,14 +12,13 @@ from torch import Tensor
 
 from fragprune_plugins.engines.calling import (
     Wanted,
-    address,
     empty,
-    expect_ok,
     native_arrays,
     native_inputs,
     native_threads,
     new_outputs,
     plain,
+    run,
     with_gradients,
 )
 from fragprune_plugins.engines.cpu import binding
@@ -58,7 +57,7 @@ class _Drawing:
             drawn["surface"] = fresh(6, view.height, view.width)
         if self.inputs.scores:
             drawn["weights_per_gaussian"] = fresh(len(splats))
-        outputs = binding.Outputs(**{name: address(each) for name, each in drawn.items()})
+        outputs = binding.Outputs(**drawn)
         given = native_inputs(
             self.inputs,
             self.arrays,
@@ -66,15 +65,8 @@ class _Drawing:
             threads=native_threads(),
             workspace=self.workspace.handle,
         )
-        error = binding.Error()
         handle = ctypes.c_void_p()
-        status = self.library.calls.fragprune_forward(
-            ctypes.byref(given),
-            ctypes.byref(outputs),
-            ctypes.byref(handle) if wanted else None,
-            ctypes.byref(error),
-        )
-        expect_ok(status, error)
+        run(self.library, "forward", given, outputs, ctypes.byref(handle) if wanted else None)
         if wanted:
             self.state = handle.value
             free = self.library.calls.fragprune_free
@@ -92,21 +84,13 @@ class _Drawing:
         by = {name: plain(grad) for name, grad in by.items()}
         per_pixel = by.pop("fragments_per_pixel", None)
         output_grads = binding.OutputGrads(
-            fragments_per_pixel=0.0 if per_pixel is None else per_pixel.item(),
-            **{name: address(grad) for name, grad in by.items()},
+            fragments_per_pixel=0.0 if per_pixel is None else per_pixel.item(), **by
         )
         shapes = {name: array.shape for name, array in self.arrays.items()}
         shapes["hook"] = torch.Size((len(self.inputs.splats), 3))
         grads = {name: empty(self.workspace, *shapes[name]) for name in wanted}
-        error = binding.Error()
-        status = self.library.calls.fragprune_backward(
-            self.state,
-            ctypes.byref(output_grads),
-            ctypes.byref(binding.InputGrads(**{k: address(g) for k, g in grads.items()})),
-            native_threads(),
-            ctypes.byref(error),
-        )
-        expect_ok(status, error)
+        to = binding.InputGrads(**grads)
+        run(self.library, "backward", self.state, output_grads, to, native_threads())
         return grads
 
 

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from fragprune_plugins.engines import create_engine
-from fragprune_plugins.engines.calling import address
 from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.engines.cuda import driver
 from fragprune_plugins.engines.cuda.engine import CudaEngine
@@ -86,11 +85,7 @@ def _sorting(gpu: Device, where: torch.device, count: int) -> Iterator[str]:
         words, tickets = words.to(where), torch.zeros(PASSES, dtype=torch.int32, device=where)
         total = torch.tensor([count], device=where)
         arguments = Sort(
-            count=address(total),
-            capacity=count,
-            histogram=address(histogram),
-            words=address(words),
-            ticket=address(tickets),
+            count=total, capacity=count, histogram=histogram, words=words, ticket=tickets
         )
         sorted_keys = keys.to(where, copy=True)
         order = torch.arange(count, dtype=torch.int32, device=where)

@@ -18,7 +18,6 @@ from torch import Tensor
 from fragprune_plugins.constants import TILE
 from fragprune_plugins.engines.calling import (
     Wanted,
-    address,
     native_arrays,
     native_inputs,
     new_outputs,
@@ -47,7 +46,7 @@ _GEOMETRY: Final = frozenset(
 )
 
 
-class Frame(ctypes.Structure):
+class Frame(binding.Named):
     """fp::Frame: the argument of a forward pass's kernels."""
 
     _fields_ = (
@@ -68,7 +67,7 @@ _PLACES: Final = frozenset(name for name, *kind in Frame._fields_ if kind == [ct
 """What of it is an address; an array of this name is there."""
 
 
-class Sort(ctypes.Structure):
+class Sort(binding.Named):
     """fp::Sort: one pass of the radix sort."""
 
     _fields_ = (
@@ -79,7 +78,7 @@ class Sort(ctypes.Structure):
     )
 
 
-class Undraw(ctypes.Structure):
+class Undraw(binding.Named):
     """fp::Undraw: the argument of a backward pass's kernels."""
 
     _fields_ = (
@@ -283,13 +282,13 @@ class Drawing:
         places = {k: arena[k] for arena in arenas for k in arena.filled & _PLACES}
         frame = Frame(
             inputs=native_inputs(inputs, self._arrays, widen="thresholds" in wanted),
-            outputs=binding.Outputs(**{name: address(each) for name, each in outputs.items()}),
-            spread=address(self._spread),
+            outputs=binding.Outputs(**outputs),
+            spread=self._spread,
             capacity=capacity,
             tiles_x=self._across,
             tiles_y=self._down,
             tile_passes=self._passes,
-            weights=address(weights),
+            weights=weights,
             **places,
         )
         self._list(frame, *arenas)
@@ -389,11 +388,7 @@ class Drawing:
             self._launch("scene", {}, "fp_ranges", blocks_of(capacity), frame)
 
     def read(self) -> int:
-        """Wait for the GPU, then return the number of entries.
-
-        Raises:
-            EngineError: the kernels could not draw this many entries or such offsets.
-        """
+        """Wait for the GPU, then return the number of entries."""
         _, entries, _, self.evaluated = map(int, self._found.tolist())
         self.entries = entries
         if entries > ENTRIES_MAX:
@@ -413,6 +408,7 @@ class Drawing:
         assert self._frame is not None
         inputs, frame, n, where = self._inputs, self._frame, self._n, self.where
         by = {name: plain(grad, where) for name, grad in by.items()}
+        per_pixel = by.pop("fragments_per_pixel", None)
         macros = unblend_macros(
             wanted,
             sh_turns="sh" in self._arrays and frame.inputs.sh_degree > 0,
@@ -435,13 +431,11 @@ class Drawing:
             grads["features"].zero_()
         arguments = Undraw(
             frame=frame,
-            by=binding.OutputGrads(
-                **{k: address(by.get(k)) for k in ("image", "invdepth", "alpha", "features")}
-            ),
-            to=binding.InputGrads(**{name: address(grad) for name, grad in grads.items()}),
-            by_fragments=address(by.get("fragments_per_pixel")),
-            background=address(by_tile),
-            sums=address(room),
+            by=binding.OutputGrads(**by),
+            to=binding.InputGrads(**grads),
+            by_fragments=per_pixel,
+            background=by_tile,
+            sums=room,
             ceiling=math.inf if inputs.cap_gradient else inputs.alpha_max,
         )
         self._launch("unblend", macros, "fp_unblend", tiles, arguments)

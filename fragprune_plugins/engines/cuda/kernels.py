@@ -101,18 +101,16 @@ class Nvrtc:
             "--ptxas-options=-v",
         ]
         try:
-            try:
-                encoded = [option.encode() for option in options]
-                self._call("nvrtcCompileProgram", program, len(encoded), encoded)
-            except Unavailable as failure:
-                said = f"{source}.cu for {target}: {failure}\n{self._log(program)}"
-                raise Unavailable(said) from None
-            log = self._log(program)
+            encoded = [option.encode() for option in options]
+            self._call("nvrtcCompileProgram", program, len(encoded), encoded)
             what = "CUBIN" if target.startswith("sm_") else "PTX"
             code = self._text(program, f"nvrtcGet{what}Size", f"nvrtcGet{what}")
+            return Image(code, self._log(program))
+        except Unavailable as failure:
+            said = f"{source}.cu for {target}: {failure}\n{self._log(program)}"
+            raise Unavailable(said) from None
         finally:
             self._call("nvrtcDestroyProgram", program)
-        return Image(code, log)
 
     def _log(self, program: Any) -> str:
         text = self._text(program, "nvrtcGetProgramLogSize", "nvrtcGetProgramLog")
@@ -134,11 +132,7 @@ _opened = cache(Nvrtc)
 
 
 def compiler() -> Nvrtc:
-    """The compiler, opened once.
-
-    Raises:
-        Unavailable: there is none, or the environment switches it off; the message says why.
-    """
+    """The compiler, opened once."""
     if os.environ.get(ENVIRONMENT, "").strip().lower() in ("off", "0"):
         raise Unavailable(f"switched off by {ENVIRONMENT}")
     return _opened()
@@ -149,9 +143,6 @@ def target_of(capability: int, architectures: tuple[int, ...]) -> str:
 
     Args:
         capability: of the GPU, major times ten plus minor.
-
-    Raises:
-        Unavailable: the GPU is too old to run the kernels.
     """
     if capability in architectures:
         return f"sm_{capability}"

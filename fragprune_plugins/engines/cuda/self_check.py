@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
 import subprocess
 import sys
 from contextlib import suppress
@@ -20,9 +19,8 @@ from typing import Final, Literal
 
 import torch
 
+from fragprune_plugins.constants import log
 from fragprune_plugins.engines.cuda import driver, kernels
-
-log = logging.getLogger("fragprune")
 
 PATIENCE: Final = 300
 """Seconds that a check may take; mostly for compiling, once."""
