@@ -60,12 +60,9 @@ def locked(path: Path, wait: float | None = None, what: str = "lock") -> Iterato
     try:
         lock.acquire(poll_interval=0.02)
     except Timeout as error:
-        raise OutputError(
-            str(path),
-            "being written by another process",
-            "one process at a time",
-            "Wait for the other process, or choose another output.",
-        ) from error
+        found = "being written by another process"
+        remedy = "Wait for the other process, or choose another output."
+        raise OutputError(str(path), found, "one process at a time", remedy) from error
     except (OSError, NotImplementedError) as error:  # filelock's word for ENOSYS
         if getattr(error, "errno", errno.ENOSYS) not in _WITHOUT_LOCKS:
             raise
@@ -102,12 +99,9 @@ def staging(path: Path) -> Iterator[Path]:
             finally:
                 shutil.rmtree(folder, ignore_errors=True)
     except OSError as error:
-        raise OutputError(
-            str(path),
-            f"cannot be written ({error.strerror or error})",
-            "a writable place",
-            "Choose another output, or free space and permissions there.",
-        ) from error
+        found = f"cannot be written ({error.strerror or error})"
+        remedy = "Choose another output, or free space and permissions there."
+        raise OutputError(str(path), found, "a writable place", remedy) from error
 
 
 @contextlib.contextmanager

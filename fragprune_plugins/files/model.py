@@ -52,19 +52,13 @@ class Model:
         check_fields(self, xyz=(n, 3), f_dc=(n, 1, 3), f_rest=(n, None, 3), opacity=(n, 1))
         check_fields(self, scaling=(n, axes), rotation=(n, 4), filter_3d=(n, 1))
         if 3 * self.f_rest.shape[1] not in REST_COUNTS:
-            raise InputError(
-                "Model.f_rest",
-                f"{self.f_rest.shape[1]} coefficients",
-                "0, 3, 8 or 15 (SH degree 0 to 3)",
-                "Pass f_rest as (N, coefficients, 3), without the first coefficient.",
-            )
+            found = f"{self.f_rest.shape[1]} coefficients"
+            remedy = "Pass f_rest as (N, coefficients, 3), without the first coefficient."
+            raise InputError("Model.f_rest", found, "0, 3, 8 or 15 (SH degree 0 to 3)", remedy)
         if self.thresholds is not None and len(self.thresholds) != n:
-            raise AlignmentError(
-                "Model.thresholds",
-                f"a store of {len(self.thresholds)} thresholds",
-                f"{n}, one per Gaussian",
-                "Pass the store of this very model.",
-            )
+            found = f"a store of {len(self.thresholds)} thresholds"
+            remedy = "Pass the store of this very model."
+            raise AlignmentError("Model.thresholds", found, f"{n}, one per Gaussian", remedy)
 
     def __len__(self) -> int:
         return len(self.xyz)

@@ -12,7 +12,6 @@ Mip-Splatting. So is one without scale_2: 2D Gaussian Splatting's, whose Gaussia
 
 from __future__ import annotations
 
-import logging
 import math
 from functools import cache
 from pathlib import Path
@@ -22,6 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from fragprune_plugins.constants import log
 from fragprune_plugins.errors import ModelFileError
 from fragprune_plugins.files.columns import change_of, is_plain
 from fragprune_plugins.files.model import REST_COUNTS, Model
@@ -57,7 +57,6 @@ focal length and squares it, and float32 ends at 1e38."""
 
 _QUATERNION_MIN = 1e-12  # torch's normalize divides by no less
 
-log = logging.getLogger("fragprune")
 _warn = cache(log.warning)  # once, because commands read a file several times
 
 _SHOWN_COLUMNS = 12
@@ -77,13 +76,10 @@ def read_ply(path: Path, *, filtered: bool = False) -> Model:
     """
     path = Path(path)
     if path.suffix == ".pth":
-        raise ModelFileError(
-            str(path),
-            "a training codebase's checkpoint, which only that codebase can draw",
-            "a trained splat (.ply)",
-            "Pass its PLY. Fine-tune and draw a host without PLYs (4D models) through its own "
-            "script, with fragprune run.",
-        )
+        found = "a training codebase's checkpoint, which only that codebase can draw"
+        remedy = "Pass its PLY. Fine-tune and draw a host without PLYs (4D models) through its own "
+        remedy += "script, with fragprune run."
+        raise ModelFileError(str(path), found, "a trained splat (.ply)", remedy)
     with _FILE.reading(path) as reading:
         rules = _rules_in(reading)
         try:
@@ -119,12 +115,9 @@ def _splat(path: Path, columns: Columns, filtered: bool) -> Model:
             "Fine-tune with fragprune run inside that host.",
         )
     if missing:
-        raise ModelFileError(
-            str(path),
-            f"a PLY without {', '.join(missing)}",
-            "the columns of a Gaussian splat",
-            "A point cloud or mesh is not a trained splat. " + _REMEDY,
-        )
+        expected = "the columns of a Gaussian splat"
+        remedy = "A point cloud or mesh is not a trained splat. " + _REMEDY
+        raise ModelFileError(str(path), f"a PLY without {', '.join(missing)}", expected, remedy)
     if scales != SCALES and not filtered:
         raise ModelFileError(
             str(path),
@@ -145,12 +138,8 @@ def _splat(path: Path, columns: Columns, filtered: bool) -> Model:
         key=lambda name: (len(name), name),
     )
     if len(rest) not in REST_COUNTS or rest != [f"f_rest_{i}" for i in range(len(rest))]:
-        raise ModelFileError(
-            str(path),
-            f"{len(rest)} f_rest columns",
-            "0, 9, 24 or 45 (SH degree 0 to 3), numbered from 0",
-            _REMEDY,
-        )
+        expected = "0, 9, 24 or 45 (SH degree 0 to 3), numbered from 0"
+        raise ModelFileError(str(path), f"{len(rest)} f_rest columns", expected, _REMEDY)
     if count == 0:
         raise ModelFileError(str(path), "0 Gaussians", "at least one", _REMEDY)
 
@@ -184,12 +173,9 @@ def _expect_no_other(path: Path, others: list[str]) -> None:
     """Refuse columns that change the picture; name those that are ignored in the log."""
     for name in others:
         if says := change_of(name):
-            raise ModelFileError(
-                str(path),
-                f"a column {name}: {says}, which a plain drawing ignores",
-                "a splat that is drawn as it is stored",
-                "Fine-tune and draw it through its host, or save it there as plain 3DGS.",
-            )
+            found = f"a column {name}: {says}, which a plain drawing ignores"
+            remedy = "Fine-tune and draw it through its host, or save it there as plain 3DGS."
+            raise ModelFileError(str(path), found, "a splat that is drawn as it is stored", remedy)
     if others:
         shown = ", ".join(others[:_SHOWN_COLUMNS])
         more = f" and {len(others) - _SHOWN_COLUMNS} more" if len(others) > _SHOWN_COLUMNS else ""
@@ -224,12 +210,9 @@ def _require_finite(path: Path, names: tuple[str, ...], data: np.ndarray[Any, An
     if bad.any():
         columns = bad.any(axis=0) if len(names) == bad.shape[1] else [True]
         where = ", ".join(n for n, b in zip(names, columns, strict=True) if b)
-        raise ModelFileError(
-            str(path),
-            f"NaN or infinity in {_rows(torch.from_numpy(bad.any(axis=1)), where)}",
-            "finite numbers",
-            "The training that wrote it diverged; use an earlier checkpoint.",
-        )
+        found = f"NaN or infinity in {_rows(torch.from_numpy(bad.any(axis=1)), where)}"
+        remedy = "The training that wrote it diverged; use an earlier checkpoint."
+        raise ModelFileError(str(path), found, "finite numbers", remedy)
 
 
 def expect_drawable(path: Path, splat: Model) -> None:
@@ -252,12 +235,9 @@ def expect_drawable(path: Path, splat: Model) -> None:
         (length.isinf(), "quaternions too long to normalise", "rotations w, x, y, z"),
     ):
         if wrong.any():
-            raise ModelFileError(
-                str(path),
-                f"{found} that nothing can be drawn with in {_rows(wrong)}",
-                expected,
-                "Remove these rows, or use an earlier checkpoint.",
-            )
+            found = f"{found} that nothing can be drawn with in {_rows(wrong)}"
+            remedy = "Remove these rows, or use an earlier checkpoint."
+            raise ModelFileError(str(path), found, expected, remedy)
 
 
 def _rows(wrong: Tensor, columns: str = "") -> str:
@@ -272,10 +252,7 @@ def _rows(wrong: Tensor, columns: str = "") -> str:
 def _store_of(path: Path, values: Tensor) -> ThresholdStore:
     outside = ~((values > 0) & (values < 1))
     if outside.any():
-        raise ModelFileError(
-            str(path),
-            f"{THRESHOLD_COLUMN} outside (0, 1) in {_rows(outside)}",
-            "falloff thresholds in (0, 1)",
-            "Export the model again with fragprune export.",
-        )
+        found = f"{THRESHOLD_COLUMN} outside (0, 1) in {_rows(outside)}"
+        remedy = "Export the model again with fragprune export."
+        raise ModelFileError(str(path), found, "falloff thresholds in (0, 1)", remedy)
     return ThresholdStore.from_falloff(values)

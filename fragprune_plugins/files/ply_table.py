@@ -55,9 +55,6 @@ def header_lines(head: bytes) -> tuple[list[bytes], int]:
 
     Args:
         head: the file's first ``HEADER_MAX`` bytes, or fewer.
-
-    Raises:
-        ValueError: it is no PLY, or its header does not end there.
     """
     end_of_line = next((end for end in (b"\r\n", b"\n", b"\r") if head[3:].startswith(end)), None)
     if not head.startswith(b"ply") or end_of_line is None:

@@ -19,19 +19,16 @@ def on_parents(session: SessionState, call: SeamCall) -> Any:
     state.pending_parents = call.how()
     try:
         result = call.run()
-        left = 0 if state.pending_parents is None else len(state.pending_parents)
-        expect_children(call, f"{left} selected parents without a child", not left)
+        if state.pending_parents is not None:
+            left = len(state.pending_parents)
+            expect_children(call, f"{left} selected parents without a child", not left)
         return result
     finally:
         state.pending_parents = None
 
 
 def on_append(session: SessionState, call: SeamCall) -> Any:
-    """Append thresholds for new rows: their parents' thresholds, or neutral ones.
-
-    Raises:
-        AlignmentError: the new rows are not copies of the parents.
-    """
+    """Append thresholds for new rows: those of their parents, whose copies they are, or neutral."""
     state = session.models.get(call.model)
     if state is None:
         return call.run()
@@ -48,9 +45,8 @@ def on_append(session: SessionState, call: SeamCall) -> Any:
         what = f"{count} new rows that are not copies of the selected parents"
         expect_children(call, what, copies)
     result = call.run()
-    before = len(state.store)
-    state.store.append(count, parents)
-    session.changed(state.store, "append", before)
+    with session.changing(state.store, "append"):
+        state.store.append(count, parents)
     return result
 
 
@@ -67,19 +63,13 @@ def on_keep(session: SessionState, call: SeamCall) -> Any:
     result = call.run()
     state = session.models.get(call.model)
     if state is not None:
-        mask = call.first
-        before = len(state.store)
-        state.store.keep(mask)
-        session.changed(state.store, "keep", before)
+        with session.changing(state.store, "keep"):
+            state.store.keep(call.first)
     return result
 
 
 def on_rearrange(session: SessionState, call: SeamCall) -> Any:
-    """Follow rows through one operation that keeps, copies and appends. In stage 2 nothing runs.
-
-    Raises:
-        AlignmentError: rows and thresholds differ in number afterwards.
-    """
+    """Follow rows through one operation that keeps, copies and appends. In stage 2 nothing runs."""
     if session.standing_still(call.model):
         return None
     state = session.models.get(call.model)
@@ -88,10 +78,9 @@ def on_rearrange(session: SessionState, call: SeamCall) -> Any:
     with call.how() as trace:
         result = call.run()
     if trace.origins is not None and trace.fresh is not None:
-        before = len(state.store)
-        state.store.rearrange(trace.origins, trace.fresh)
-        state.views.clear()  # their calls may hold tensors of the old rows
-        session.changed(state.store, "rearrange", before)
+        with session.changing(state.store, "rearrange"):
+            state.store.rearrange(trace.origins, trace.fresh)
+            state.views.clear()  # their calls may hold tensors of the old rows
     session.expect_rows(call.model, state, str(call.seam))
     return result
 

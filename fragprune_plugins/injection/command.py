@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import logging
 import re
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
+from fragprune_plugins.constants import log
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.hosts.adapter import CommandLine, ConfigFile, read_config
 from fragprune_plugins.hosts.source import HostRepo
 
 _OPTION = re.compile("-[bBdEiIOPqsSuvx]+|-[WX].*")
 """Options of the interpreter. Those that name what to run are not among them: ``-c`` and ``-m``."""
-
-log = logging.getLogger("fragprune")
 
 
 @dataclass
@@ -101,9 +99,6 @@ def split(command: list[str]) -> tuple[Path, list[str], str]:
     """(script, arguments, module) of a command; a leading interpreter is dropped.
 
     ``module`` is "" unless the command is ``python -m module``.
-
-    Raises:
-        UsageError: the command names no script, or the script does not exist.
     """
     words = list(command)
     if words and Path(words[0]).name.startswith("python"):
@@ -149,27 +144,17 @@ def _script_of(module: str) -> Path:
             script = repo.path(f"{module}.__main__") if repo else None
         if script is not None:
             return script
-    raise UsageError(
-        f"python -m {module}",
-        "no such module",
-        "a module in this folder or of an installed package",
-        "Go to the host's folder, install the package, or check the name.",
-    )
+    expected = "a module in this folder or of an installed package"
+    remedy = "Go to the host's folder, install the package, or check the name."
+    raise UsageError(f"python -m {module}", "no such module", expected, remedy)
 
 
 def overrule(config: ConfigFile, path: Path, copy: Path, given: dict[str, Any]) -> None:
-    """Write a copy of a configuration file with other values, and check it by reading it.
-
-    Raises:
-        UsageError: the copy does not hold the values.
-    """
+    """Write a copy of a configuration file with other values, and check it by reading it."""
     values = {flag.lstrip("-"): value for flag, value in given.items()}
     copy.write_text(config.copied(path, values), encoding="utf-8")
     said = read_config(config, copy)
     if ignored := sorted(name for name in values if said.get(name) != values[name]):
-        raise UsageError(
-            f"{config.flag} {path}",
-            f"a layout to which {', '.join(ignored)} cannot be added",
-            "the layout of the host's own examples",
-            "Write the file in that layout.",
-        )
+        found = f"a layout to which {', '.join(ignored)} cannot be added"
+        expected = "the layout of the host's own examples"
+        raise UsageError(f"{config.flag} {path}", found, expected, "Write the file in that layout.")

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import logging
 import tempfile
 import time
 from functools import partial
 from pathlib import Path
 
+from fragprune_plugins.constants import log
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.hosts import preflight
@@ -20,8 +20,6 @@ from fragprune_plugins.injection.options import RunOptions, RunSummary
 from fragprune_plugins.injection.stages import Stages
 from fragprune_plugins.plugins.hooks import engine_for, select_adapter
 from fragprune_plugins.plugins.loading import Plugins, installed
-
-log = logging.getLogger("fragprune")
 
 __all__ = ["RunOptions", "RunSummary", "run"]
 

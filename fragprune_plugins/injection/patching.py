@@ -51,12 +51,7 @@ class PatchLedger:
                 later, the host's ``import`` raises it.
         """
 
-        def standing_aside(
-            wrapped: Callable[..., Any],
-            instance: Any,
-            args: tuple[Any, ...],
-            kwargs: dict[str, Any],
-        ) -> Any:
+        def standing_aside(wrapped: Any, instance: Any, args: Any, kwargs: Any) -> Any:
             if not self._live:
                 return wrapped(*args, **kwargs)
             return wrapper(wrapped, instance, args, kwargs)
@@ -91,19 +86,14 @@ class PatchLedger:
             module, seam, handle = self._wrapped.pop()
             try:
                 wrapt.unwrap_object(module, seam.attribute, handle)
-                if "." not in seam.attribute:  # only the class holds a method
-                    _rebind(seam.attribute, handle, module)
+                # Copies by ``from module import name``; of a method there are none.
+                for other in _holding(seam.attribute, handle).values():
+                    setattr(other, seam.attribute, getattr(module, seam.attribute))
             except (wrapt.WrapperNotOutermostError, wrapt.WrapperNotFoundError) as error:
-                findings.append(
-                    Finding(
-                        "warning",
-                        "not-undone",
-                        str(seam),
-                        str(error),
-                        "fragprune's wrapper outermost",
-                        "The wrapper stays, and only calls the original.",
-                    )
-                )
+                expected = "fragprune's wrapper outermost"
+                remedy = "The wrapper stays, and only calls the original."
+                said = str(seam), str(error), expected, remedy
+                findings.append(Finding("warning", "not-undone", *said))
         return findings
 
     def _is_hosts(self, module: ModuleType) -> bool:
@@ -115,12 +105,9 @@ class PatchLedger:
     def _check(self, module: ModuleType, seam: Seam) -> None:
         if not seam.external and not self._is_hosts(module):
             # Hosts' modules have common names, and some hosts append their folder to the path.
-            raise SeamError(
-                str(seam),
-                f"a module of the same name from {module.__file__}",
-                f"the host's module, in {self._root}",
-                "Uninstall the other module, or remove it from PYTHONPATH.",
-            )
+            found = f"a module of the same name from {module.__file__}"
+            remedy = "Uninstall the other module, or remove it from PYTHONPATH."
+            raise SeamError(str(seam), found, f"the host's module, in {self._root}", remedy)
         try:
             original = wrapt.resolve_path(module, seam.attribute)[2]
         except AttributeError as error:
@@ -136,17 +123,14 @@ class PatchLedger:
         For a function outside the host (``seam.external``), only copies in the host's modules
         count.
         """
-        head = seam.attribute.split(".")[0]
-        if head != seam.attribute:
+        name = seam.attribute
+        original = getattr(module, name, None)
+        if "." in name or original is None:
             return  # a method is patched on its class, which all modules share
-        original = getattr(module, head, None)
         holders = [
-            name
-            for name, other in list(sys.modules.items())
-            if other is not module
-            and original is not None
-            and getattr(other, "__dict__", {}).get(head) is original
-            and (not seam.external or self._is_hosts(other))
+            key
+            for key, other in _holding(name, original).items()
+            if other is not module and (not seam.external or self._is_hosts(other))
         ]
         if holders:
             found = f"already imported, and bound by name in {', '.join(sorted(holders))}"
@@ -154,8 +138,7 @@ class PatchLedger:
             raise LateImportError(str(seam), found, "activation before the host's imports", remedy)
 
 
-def _rebind(name: str, ours: Any, module: ModuleType) -> None:
-    """Replace other modules' copies of the wrapper ``ours`` by the module's restored function."""
-    for other in list(sys.modules.values()):
-        if getattr(other, "__dict__", {}).get(name) is ours:
-            setattr(other, name, getattr(module, name))
+def _holding(name: str, thing: Any) -> dict[str, ModuleType]:
+    """The modules that hold a thing by this name."""
+    loaded = list(sys.modules.items())
+    return {key: each for key, each in loaded if getattr(each, "__dict__", {}).get(name) is thing}

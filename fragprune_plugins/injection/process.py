@@ -61,17 +61,15 @@ def telling(script: Path, root: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def host_process(
-    script: Path, arguments: list[str], device: str, folder: Path | None = None
-) -> Iterator[None]:
+def host_process(script: Path, arguments: list[str], device: str, folder: Path) -> Iterator[None]:
     """Inside, ``sys.argv``, ``sys.path`` and devices are set for the script; then restored.
 
     Args:
-        folder: the first folder of the module search path; None for the script's folder.
+        folder: the first folder of the module search path.
     """
     saved = sys.argv, sys.path[:], sys.stdout, sys.stderr
     sys.argv = [str(script), *arguments]
-    sys.path.insert(0, str(folder or script.parent))
+    sys.path.insert(0, str(folder))
     try:
         with surroundings(device):
             yield

@@ -9,7 +9,6 @@ from __future__ import annotations
 import ast
 import hashlib
 import json
-import logging
 import os
 import sys
 from contextlib import suppress
@@ -18,7 +17,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fragprune_plugins.constants import VERSION
+from fragprune_plugins.constants import VERSION, log
 from fragprune_plugins.engines.cuda.kernels import cache_folder, digest_of_sources
 from fragprune_plugins.errors import EngineError, InputError, ProofError
 from fragprune_plugins.files.atomic import replacing
@@ -28,8 +27,6 @@ from fragprune_plugins.hosts.source import parsed
 
 if TYPE_CHECKING:
     from fragprune_plugins.injection.state import SessionState
-
-log = logging.getLogger("fragprune")
 
 _ENDINGS = (".py", ".so", ".pyd", ".cu", ".cuh", ".cpp", ".h")
 

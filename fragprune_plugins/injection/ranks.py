@@ -17,10 +17,6 @@ def expect_one() -> None:
 
     The store of thresholds would learn from one rank's views only, and each rank would write its
     own sidecar.
-
-    Raises:
-        RanksError: torchrun or another launcher set WORLD_SIZE, or the host has initialized
-            ``torch.distributed``, with more than one process.
     """
     said = os.environ.get("WORLD_SIZE", "")
     ranks, found = int(said) if said.isdigit() else 1, f"WORLD_SIZE={said} in the environment"
@@ -34,19 +30,12 @@ def expect_one() -> None:
 
 
 def expect_no_launcher(command: list[str]) -> None:
-    """Check that a host's command does not start several processes.
-
-    Raises:
-        RanksError: it is torchrun's, or another launcher's.
-    """
+    """Check that a host's command does not start several processes."""
     words = [Path(word).name for word in command[:3]]
     if words and words[0].startswith("python") and words[1:2] == ["-m"]:
         words = words[2:]
     if words and words[0] in _LAUNCHERS:
-        raise RanksError(
-            "command",
-            f"{words[0]}, which starts several processes",
-            "the host's own script, in one process",
-            "Leave the launcher out: -- python train.py ... To use several GPUs, train without "
-            "fragprune, then torchrun -m fragprune_plugins finetune.",
-        )
+        expected = "the host's own script, in one process"
+        remedy = "Leave the launcher out: -- python train.py ... To use several GPUs, train "
+        remedy += "without fragprune, then torchrun -m fragprune_plugins finetune."
+        raise RanksError("command", f"{words[0]}, which starts several processes", expected, remedy)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fragprune_plugins.constants import NEUTRAL_LOGIT
+from fragprune_plugins.constants import NEUTRAL_LOGIT, log
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import AlignmentError, SessionError, UsageError
 from fragprune_plugins.hosts.dialect import HostCall
@@ -30,9 +29,6 @@ from fragprune_plugins.learning.area import area_per_pixel
 from fragprune_plugins.learning.goals import Fewer
 from fragprune_plugins.plugins.hooks import thresholds_for
 from fragprune_plugins.types import RasterInputs, RasterOutputs
-
-log = logging.getLogger("fragprune")
-
 
 _AMP = "torch.amp" if hasattr(torch.amp, "GradScaler") else "torch.cuda.amp"  # before torch 2.3
 SCALER = Seam(Role.LOSS, f"{_AMP}.grad_scaler", "GradScaler.scale", ("outputs",), external=True)
@@ -73,7 +69,17 @@ def on_view(session: SessionState, call: SeamCall) -> Any:
             begin_step(session, model, state)
         else:
             expect_to_train(session, call, model)
-    again = partial(draw_view, session, call.function, model, view, call.args, call.kwargs)
+
+    def again() -> Any:
+        """Call the host's function; inside, ``session.rendering`` holds its model and view."""
+        token = session.rendering.set((model, view))
+        try:
+            with asking_for_no_gradient(frozen_parameters(session, model)) as cut:
+                given = {name: cut(each) for name, each in call.kwargs.items()}
+                return call.function(*map(cut, call.args), **given)
+        finally:
+            session.rendering.reset(token)
+
     measured = isinstance(session.settings.goal, Fewer)  # a kept view keeps its model alive
     if state is not None and state.stage is not None:
         learned = torch.is_grad_enabled()
@@ -89,11 +95,7 @@ def on_view(session: SessionState, call: SeamCall) -> Any:
 
 
 def expect_to_train(session: SessionState, call: SeamCall, model: Any) -> None:
-    """Refuse to learn in a phase of the host's training that comes before stage 2.
-
-    Raises:
-        UsageError: the model is already frozen in it.
-    """
+    """Refuse to learn in a phase of the host's training that comes before stage 2."""
     if session.standing_still(model):
         where, found = f"{session.adapter.name}: {call.seam}", "an earlier phase than stage 2's"
         remedy = "Name a trained model to start from, or an iteration above 0 after which stage 2 "
@@ -102,11 +104,7 @@ def expect_to_train(session: SessionState, call: SeamCall, model: Any) -> None:
 
 
 def expect_unpacked_attached(session: SessionState, call: SeamCall) -> None:
-    """Refuse to draw an unpacked file's Gaussians without its thresholds.
-
-    Raises:
-        SessionError: no seam attached the model that they are in.
-    """
+    """Refuse to draw an unpacked file's Gaussians without its thresholds."""
     means = session.adapter.model_of(call)
     if session.unpacked is None or session.pausing.get() or not isinstance(means, Tensor):
         return
@@ -117,24 +115,8 @@ def expect_unpacked_attached(session: SessionState, call: SeamCall) -> None:
         raise SessionError(str(call.seam), found, "a model with its thresholds", remedy)
 
 
-def draw_view(
-    session: SessionState, render: Any, model: Any, view: int, args: Any, kwargs: Any
-) -> Any:
-    """Call the host's function; inside, ``session.rendering`` holds its model and view."""
-    token = session.rendering.set((model, view))
-    try:
-        with asking_for_no_gradient(frozen_parameters(session, model)) as cut:
-            return render(*map(cut, args), **{name: cut(each) for name, each in kwargs.items()})
-    finally:
-        session.rendering.reset(token)
-
-
 def on_rasterize(session: SessionState, call: SeamCall) -> Any:
-    """Draw with thresholds and the stop. Without either the host's rasterizer draws.
-
-    Raises:
-        AlignmentError: the call's Gaussians and the thresholds differ in number.
-    """
+    """Draw with thresholds and the stop. Without either the host's rasterizer draws."""
     rendering = session.rendering.get()
     state = session.models.get(rendering[0]) if rendering else None
     drawn = HostCall.of(call)
@@ -291,11 +273,7 @@ def on_loss(session: SessionState, call: SeamCall) -> Any:
 def refuse_scaled(
     session: SessionState, scale: Callable[..., Any], scaler: Any, args: Any, kwargs: Any
 ) -> Any:
-    """Refuse a scaled loss: the pressure would be divided with it, and is not multiplied before.
-
-    Raises:
-        UsageError: the host's gradient scaler is on while thresholds learn.
-    """
+    """Refuse a scaled loss: the pressure would be divided with it, and is not multiplied before."""
     if session.learn and scaler.is_enabled():
         found = "a scaled loss, beside which the pressure vanishes"
         remedy = "Train in float32, or with GradScaler(enabled=False)."

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -18,8 +17,6 @@ from fragprune_plugins.hosts.adapter import CHECKPOINT_KEY, optimizer_state
 from fragprune_plugins.hosts.seams import SeamCall
 from fragprune_plugins.injection.state import ModelState, SessionState
 from fragprune_plugins.learning.thresholds import ThresholdStore
-
-log = logging.getLogger("fragprune")
 
 
 def on_save(session: SessionState, call: SeamCall) -> Any:
@@ -94,9 +91,6 @@ def attach_file(session: SessionState, model: Any, expected: Tensor, store: Thre
 
     Args:
         expected: (N, 3) means of the unpacked file.
-
-    Raises:
-        AlignmentError: the model has other means.
     """
     means, known = session.adapter.means(model), session.models.get(model)
     parts = slice(1), slice(None)  # the first row tells most others apart

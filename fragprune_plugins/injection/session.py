@@ -166,11 +166,7 @@ class Session(SessionState):
         return summary
 
     def expect_drawn(self) -> None:
-        """Check that a run that counted learned steps drew a view with thresholds.
-
-        Raises:
-            SessionError: it drew none.
-        """
+        """Check that a run that counted learned steps drew a view with thresholds."""
         stage = self.last_state.stage if self.last_state else None
         if stage and stage.steps and self.settings.goal.presses and not stage.viewed:
             found = f"{stage.steps} steps, and no view of the trained model drawn with thresholds"

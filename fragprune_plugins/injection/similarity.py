@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from fragprune_plugins.constants import log
 from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.engines.losses import compiled_loss
 from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.state import SessionState
-
-log = logging.getLogger("fragprune")
 
 TOLERANCE = 1e-3
 """How far apart the two may be: values, and gradients as a share of the largest."""

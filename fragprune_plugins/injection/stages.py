@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import logging
 import sys
 import time
 from collections.abc import Callable
@@ -19,6 +18,7 @@ from typing import Any
 
 from torch import Tensor
 
+from fragprune_plugins.constants import log
 from fragprune_plugins.errors import (
     HostFailed,
     Interrupted,
@@ -41,8 +41,6 @@ from fragprune_plugins.learning.events import Summary
 from fragprune_plugins.learning.interruption import Terminate, sigterm_interrupts
 from fragprune_plugins.learning.schedule import JointSchedule, Settings
 from fragprune_plugins.plugins.loading import Plugins
-
-log = logging.getLogger("fragprune")
 
 
 @dataclass
@@ -343,12 +341,10 @@ class Stages:
             drawing = self.adapter.drawing(self.repo, self.host.arguments)
             joint = self.options.stage == "joint"  # the model of before is another training's
             if not self.after or not (self.before or joint):
-                raise NotComparedError(
-                    f"--stage {self.options.stage}",
-                    f"no model from {'before' if self.after else 'after'} the learning",
-                    "a model that the host saved",
-                    "Have the host save its model before and after.",
-                )
+                found = f"no model from {'before' if self.after else 'after'} the learning"
+                expected = "a model that the host saved"
+                remedy = "Have the host save its model before and after."
+                raise NotComparedError(f"--stage {self.options.stage}", found, expected, remedy)
             return self.adapter.photographs(self.repo, self.host.arguments), drawing, None
         except NotComparedError as error:
             return None, {}, error
@@ -369,12 +365,10 @@ class Stages:
             at_end = self.options.from_iter is None and start > resumed
             where = "densification ends" if at_end else "learning begins"
             flag = f"Raise {self.host.line.spellings('iterations')[-1]}"
-            raise UsageError(
-                f"--stage {self.options.stage}",
-                f"iterations {resumed + 1} to {total}" if resumed < total else "no iterations",
-                f"iterations after {start}, where {where}",
-                f"{flag}, or lower --from-iter." if start > resumed else f"{flag}.",
-            )
+            found = f"iterations {resumed + 1} to {total}" if resumed < total else "no iterations"
+            expected = f"iterations after {start}, where {where}"
+            remedy = f"{flag}, or lower --from-iter." if start > resumed else f"{flag}."
+            raise UsageError(f"--stage {self.options.stage}", found, expected, remedy)
         settings = replace(self.options.settings, iterations=end - (resumed if joint else start))
         options: dict[str, Any] = {"from_step": start - resumed}
         if joint:

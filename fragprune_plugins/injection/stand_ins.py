@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import sys
 from collections.abc import Callable
@@ -13,11 +12,10 @@ from typing import Any
 
 import torch
 
+from fragprune_plugins.constants import log
 from fragprune_plugins.errors import LateImportError
 from fragprune_plugins.hosts.dialect import Dialect, HostCall
 from fragprune_plugins.hosts.preflight import present
-
-log = logging.getLogger("fragprune")
 
 
 def runs_here(dialect: Dialect, package: str) -> bool:
@@ -50,11 +48,7 @@ class StandIns:
         self._placed: dict[str, ModuleType] = {}
 
     def place(self) -> None:
-        """Put the stand-ins into ``sys.modules``.
-
-        Raises:
-            LateImportError: the host has already imported one of these packages.
-        """
+        """Put the stand-ins into ``sys.modules``."""
         self._made = self._made or self._dialect.modules(self._draw)
         for name, module in self._made.items():
             package = name.split(".")[0]
@@ -87,11 +81,7 @@ class StandIns:
         self._placed.clear()
 
     def refuse_leftovers(self, root: Path) -> None:
-        """Refuse a host that was imported in an earlier session and draws with its classes.
-
-        Raises:
-            LateImportError: a module of the host holds a class of an earlier session's stand-in.
-        """
+        """Refuse a host that was imported in an earlier session and draws with its classes."""
         inside = f"{root}{os.sep}"
         hosts = [
             module
@@ -104,9 +94,7 @@ class StandIns:
                 for module in hosts:
                     held = vars(module).get(member, ours)
                     if held is not ours and maker and getattr(held, "__module__", None) == maker:
-                        raise LateImportError(
-                            f"{name}.{member}",
-                            f"bound in {module.__name__} since an earlier session",
-                            "a host that is imported in this session",
-                            "Activate the earlier session again, or start a new process.",
-                        )
+                        found = f"bound in {module.__name__} since an earlier session"
+                        expected = "a host that is imported in this session"
+                        remedy = "Activate the earlier session again, or start a new process."
+                        raise LateImportError(f"{name}.{member}", found, expected, remedy)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import logging
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,6 +12,7 @@ import torch
 from plyfile import PlyData
 from torch import Tensor
 
+from fragprune_plugins.constants import log
 from fragprune_plugins.errors import ModelFileError, UsageError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.atomic import replacing
@@ -27,8 +27,6 @@ from fragprune_plugins.hosts.adapter import (
 from fragprune_plugins.injection.command import HostCommand
 from fragprune_plugins.injection.process import knowing_numpy
 from fragprune_plugins.injection.saving import changed, tensors_of
-
-log = logging.getLogger("fragprune")
 
 _FILE = UntrustedFile(
     ModelFileError,

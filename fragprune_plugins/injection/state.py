@@ -7,9 +7,9 @@ store.
 
 from __future__ import annotations
 
-import logging
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from fragprune_plugins.constants import log
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import AlignmentError, SessionError
 from fragprune_plugins.files import sidecar
@@ -34,8 +35,6 @@ from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.hooks import engine_for, schedule_for
 from fragprune_plugins.plugins.loading import Plugins
 from fragprune_plugins.types import one_line
-
-log = logging.getLogger("fragprune")
 
 
 @dataclass
@@ -204,8 +203,11 @@ class SessionState:
         if main is None or main is model or main not in self.models:
             self.last, self.last_state = weakref.ref(model), state
 
-    def changed(self, store: ThresholdStore, operation: str, before: int) -> None:
-        """Tell observers that rows changed."""
+    @contextmanager
+    def changing(self, store: ThresholdStore, operation: str) -> Iterator[None]:
+        """Tell observers of the rows that a store gets and loses inside."""
+        before = len(store)
+        yield
         change = PopulationChange(operation, before, len(store))
         self.plugins.tell(hookspecs.fragprune_population_changed, store=store, change=change)
 
@@ -226,9 +228,8 @@ class SessionState:
         """
         state = self.models.get(model)
         if state is None:
-            raise SessionError(
-                "save()", "a model without thresholds", "a trained model", "Train the model first."
-            )
+            found, remedy = "a model without thresholds", "Train the model first."
+            raise SessionError("save()", found, "a trained model", remedy)
         self.expect_rows(model, state, str(path))
         learned = state.store.cuts or self.standing_still(model)
         if learned and state.stage is not None and state.stage.warming_up:

@@ -48,9 +48,8 @@ def on_attach(session: SessionState, call: SeamCall) -> Any:
     session.rates[model] = {name: group["lr"] for name, group in groups if name}
     means = session.adapter.means(model)
     if state is not None and not kept:
-        before = len(state.store)
-        state.store.replace(len(means))
-        session.changed(state.store, "training_setup", before)
+        with session.changing(state.store, "training_setup"):
+            state.store.replace(len(means))
     if not session.learn:
         return result
     if state is None:
@@ -127,34 +126,27 @@ def before_step(session: SessionState, reference: Any, optimizer: Any, *_: Any) 
         return
     lent: list[tuple[dict[str, Any], Any]] = []
     state.lent.append(lent)
-    if not session.standing_still(model):
-        expect_sound(session, model, state)
-        return
-    trained = session.trained
-    stage, rates = state.stage, session.rates[model]
-    scheduled = {group.name for group in session.adapter.groups if group.scheduled}
-    for group in optimizer.param_groups:
-        name = session.adapter.group_name(model, group)
-        if trained is not None and name not in trained:
-            for parameter in group["params"]:
-                parameter.grad = None
-        elif stage is not None and name in rates and name not in scheduled:
-            lent.append((group, group["lr"]))
-            group["lr"] = stage.rate(name, rates[name])
-    expect_sound(session, model, state)
+    if session.standing_still(model):
+        trained, stage, rates = session.trained, state.stage, session.rates[model]
+        scheduled = {group.name for group in session.adapter.groups if group.scheduled}
+        for group in optimizer.param_groups:
+            name = session.adapter.group_name(model, group)
+            if trained is not None and name not in trained:
+                for parameter in group["params"]:
+                    parameter.grad = None
+            elif stage is not None and name in rates and name not in scheduled:
+                lent.append((group, group["lr"]))
+                group["lr"] = stage.rate(name, rates[name])
+    expect_sound(state)
 
 
-def expect_sound(session: SessionState, model: Any, state: ModelState) -> None:
+def expect_sound(state: ModelState) -> None:
     """Raise DivergedError, before an optimizer steps, unless all gradients are finite."""
-    if state.stage is None or state.stage.plan is None:
-        return
-    parameters = state.stage.parameters()
-    gradients = {
-        name: parameter.grad.to_dense() if parameter.grad.is_sparse else parameter.grad
-        for name, parameter in parameters.items()
-        if parameter.grad is not None
-    }
-    state.stage.expect_sound(gradients)
+    if state.stage is not None and state.stage.plan is not None:
+        given = {name: each.grad for name, each in state.stage.parameters().items()}
+        found = {name: grad for name, grad in given.items() if grad is not None}
+        dense = {name: grad.to_dense() if grad.is_sparse else grad for name, grad in found.items()}
+        state.stage.expect_sound(dense)
 
 
 def after_step(session: SessionState, reference: Any, *_: Any) -> None:

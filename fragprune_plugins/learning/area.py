@@ -78,12 +78,8 @@ def project(
         InputError: they are surfels.
     """
     if splats.flat:
-        raise InputError(
-            "portable",
-            "surfels (2 scales each), which viewers of 3D Gaussians do not draw",
-            "3D Gaussians",
-            "Leave --portable out.",
-        )
+        found = "surfels (2 scales each), which viewers of 3D Gaussians do not draw"
+        raise InputError("portable", found, "3D Gaussians", "Leave --portable out.")
     view, means = inputs.view, splats.means.detach()
     points = means @ view.viewmatrix[:3, :3] + view.viewmatrix[3, :3]
     visible = points[:, 2] > inputs.near

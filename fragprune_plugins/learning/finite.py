@@ -38,10 +38,7 @@ def expect_finite(tensors: Mapping[str, Tensor], where: str) -> None:
         where: the training and its step, for the message.
     """
     if found := not_finite(tensors):
-        raise DivergedError(
-            where,
-            f"NaN or infinity in {', '.join(found)}",
-            "finite numbers",
-            "Nothing of it was saved. Begin again from the model before; if that one is not "
-            "finite either, begin from an earlier one.",
-        )
+        expected = "finite numbers"
+        remedy = "Nothing of it was saved. Begin again from the model before; if that one is not "
+        remedy += "finite either, begin from an earlier one."
+        raise DivergedError(where, f"NaN or infinity in {', '.join(found)}", expected, remedy)

@@ -170,12 +170,8 @@ def parse_goal(text: str, goals: Mapping[str, type[Goal]] = GOALS) -> Goal:
     try:
         return goals[name](*([float(number)] if number else []))
     except (KeyError, ValueError, TypeError) as error:
-        raise UsageError(
-            "goal",
-            repr(text)[:80],
-            f"one of {', '.join(goals)}, with =X for its number",
-            "Choose one.",
-        ) from error
+        expected = f"one of {', '.join(goals)}, with =X for its number"
+        raise UsageError("goal", repr(text)[:80], expected, "Choose one.") from error
 
 
 def number(what: str, value: object) -> float:

@@ -20,7 +20,6 @@ were learned from. Results on held-out views are for the driver to measure.
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -30,6 +29,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from fragprune_plugins.constants import log
 from fragprune_plugins.errors import DivergedError, ResetError
 from fragprune_plugins.learning.events import Progress, StepStats
 from fragprune_plugins.learning.finite import are_finite, expect_finite, not_finite
@@ -45,8 +45,6 @@ from fragprune_plugins.learning.targets import (
 )
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs, RasterOutputs
-
-log = logging.getLogger("fragprune")
 
 RESET, MOSTLY = 0.0101, 0.9
 """Opacity that a host's reset leaves at most, and the share of Gaussians that have no more then."""
@@ -186,14 +184,12 @@ class Stage2:
         share = float((opacities <= RESET).float().mean()) if opacities.numel() else 0.0
         if share < MOSTLY:
             return
-        error = ResetError(
-            "stage 2",
-            f"opacities of at most 0.01 in {share:.0%} of {opacities.numel():,} Gaussians, as a "
-            "reset of opacities leaves them",
-            "a model that has trained on since its last reset",
-            "Train on before stage 2, or let densification, which resets, end earlier (3DGS: "
-            "--densify_until_iter below the last iteration); then --stage finetune.",
-        )
+        found = f"opacities of at most 0.01 in {share:.0%} of {opacities.numel():,} Gaussians, as "
+        found += "a reset of opacities leaves them"
+        expected = "a model that has trained on since its last reset"
+        remedy = "Train on before stage 2, or let densification, which resets, end earlier (3DGS: "
+        remedy += "--densify_until_iter below the last iteration); then --stage finetune."
+        error = ResetError("stage 2", found, expected, remedy)
         if not isinstance(self.schedule, JointSchedule):
             raise error
         log.warning("%s", error)  # the host's training goes on, and may recover
@@ -298,15 +294,13 @@ class Stage2:
         known = dict(gradients) | ({} if ours is None else {"thresholds": ours})
         if are_finite(known.values()):
             return
-        found = not_finite({name: each.float().square() for name, each in known.items()})
-        if not found:  # very large, and Adam can take it
+        broken = not_finite({name: each.float().square() for name, each in known.items()})
+        if not broken:  # very large, and Adam can take it
             return
-        raise DivergedError(
-            f"stage 2, step {self.steps}" + (f", view {self.picture}" if self.picture else ""),
-            f"NaN or infinity in the gradient of {', '.join(found)}",
-            "finite gradients",
-            "Nothing of it was taken over. Look at that view and its photograph.",
-        )
+        where = f"stage 2, step {self.steps}" + (f", view {self.picture}" if self.picture else "")
+        found = f"NaN or infinity in the gradient of {', '.join(broken)}"
+        remedy = "Nothing of it was taken over. Look at that view and its photograph."
+        raise DivergedError(where, found, "finite gradients", remedy)
 
     def end(self) -> None:
         """The driver's optimizer has stepped: so do the thresholds.

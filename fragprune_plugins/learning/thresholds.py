@@ -19,6 +19,7 @@ from fragprune_plugins.types import Rim, is_rim, is_stop, short
 
 _START_MARGIN = 1e-4  # thresholds start this far (relative) below the 1/255 skip: nothing changes
 _START_MAX = 0.99
+_MOMENTS = {"exp_avg": "their moments", "exp_avg_sq": "their second moments"}  # Adam's
 _ROUNDING = 1e-4  # relative: sigmoid of logit loses less, unless the logit had to be clamped
 
 Known = TypeVar("Known")
@@ -79,12 +80,9 @@ class ThresholdStore:
         """
         inside = thresholds.ndim == 1 and thresholds.is_floating_point()
         if not inside or not bool(((thresholds > 0) & (thresholds < 1)).all()):
-            raise InputError(
-                "thresholds",
-                short(thresholds) + (", some outside (0, 1)" if inside else ""),
-                "(N,) falloff in (0, 1)",
-                "Correct them; ThresholdStore.from_alpha takes a limit of alpha.",
-            )
+            found = short(thresholds) + (", some outside (0, 1)" if inside else "")
+            remedy = "Correct them; ThresholdStore.from_alpha takes a limit of alpha."
+            raise InputError("thresholds", found, "(N,) falloff in (0, 1)", remedy)
         store, values = cls(len(thresholds), thresholds.device, lr), thresholds.detach().float()
         neutral = torch.sigmoid(torch.full_like(values, NEUTRAL_LOGIT))
         logits = torch.logit(values)
@@ -231,12 +229,10 @@ class ThresholdStore:
         """Keep the rows where mask (N,) bool is True, in their order, with their moments."""
         mask = torch.as_tensor(mask, device=self.logits.device)
         if mask.dtype != torch.bool or mask.ndim != 1:
-            raise AlignmentError(
-                "ThresholdStore.keep",
-                f"a {mask.dtype} mask of shape {tuple(mask.shape)}",
-                f"a bool mask ({len(self)},)",
-                "Pass the rows to keep as booleans.",
-            )
+            found = f"a {mask.dtype} mask of shape {tuple(mask.shape)}"
+            expected = f"a bool mask ({len(self)},)"
+            remedy = "Pass the rows to keep as booleans."
+            raise AlignmentError("ThresholdStore.keep", found, expected, remedy)
         self._expect(len(mask), "keep")
         self._resize(lambda rows: rows[mask])
 
@@ -266,8 +262,8 @@ class ThresholdStore:
         origins = self._rows(origins, len(fresh), "rearrange")
         self._resize(lambda rows: rows[origins])
         if state := self.optimizer.state.get(self.logits):
-            state["exp_avg"][fresh] = 0
-            state["exp_avg_sq"][fresh] = 0
+            for name in _MOMENTS:
+                state[name][fresh] = 0
 
     def replace(self, count: int) -> None:
         """Start over for another population: ``count`` neutral rows with zero moments."""
@@ -278,8 +274,7 @@ class ThresholdStore:
     def numbers(self) -> dict[str, Tensor]:
         """All learned tensors, each (N,), by a name for messages."""
         state = self.optimizer.state.get(self.logits, {})
-        moments = {"exp_avg": "their moments", "exp_avg_sq": "their second moments"}
-        named = {name: state[key] for key, name in moments.items() if key in state}
+        named = {said: state[name] for name, said in _MOMENTS.items() if name in state}
         return {"thresholds": self.logits.detach(), **named}
 
     def state_dict(self) -> dict[str, Any]:
@@ -288,8 +283,7 @@ class ThresholdStore:
         zeros = torch.zeros_like(self.logits)
         return {
             "logits": self.logits.detach().clone(),
-            "exp_avg": state.get("exp_avg", zeros).detach().clone(),
-            "exp_avg_sq": state.get("exp_avg_sq", zeros).detach().clone(),
+            **{name: state.get(name, zeros).detach().clone() for name in _MOMENTS},
             "adam_step": float(state.get("step", 0.0)),
             "steps": self.steps,
             **({} if self.stop is None else {"stop": self.stop}),
@@ -303,7 +297,7 @@ class ThresholdStore:
             SidecarError: the state's parts do not fit together, or are no numbers that learning
                 can have left.
         """
-        rows = {key: state[key] for key in ("logits", "exp_avg", "exp_avg_sq")}
+        rows = {name: state[name] for name in ("logits", *_MOMENTS)}
         stop, rim = state.get("stop"), state.get("rim", "hard")  # absent before there were any
         kinds = [(tuple(t.shape), t.dtype) for t in rows.values()]
         if set(kinds) != {((rows["logits"].numel(),), torch.float32)}:
@@ -324,18 +318,9 @@ class ThresholdStore:
         self._bind(rows["logits"].to(device), lr)
         self.steps = int(state["steps"])
         if state["adam_step"] > 0:
-            self._set_moments(
-                rows["exp_avg"].to(device).clone(),
-                rows["exp_avg_sq"].to(device).clone(),
-                torch.tensor(float(state["adam_step"]), dtype=torch.float32),
-            )
-
-    def _set_moments(self, exp_avg: Tensor, exp_avg_sq: Tensor, step: Tensor) -> None:
-        self.optimizer.state[self.logits] = {
-            "step": step,
-            "exp_avg": exp_avg,
-            "exp_avg_sq": exp_avg_sq,
-        }
+            step = torch.tensor(float(state["adam_step"]), dtype=torch.float32)
+            moments = {name: rows[name].to(device).clone() for name in _MOMENTS}
+            self.optimizer.state[self.logits] = {"step": step, **moments}
 
     def _resize(self, change: Callable[[Tensor], Tensor]) -> None:
         """Apply a row operation to logits and moments alike."""
@@ -343,7 +328,8 @@ class ThresholdStore:
         lr = self.optimizer.param_groups[0]["lr"]
         self._bind(change(self.logits.detach()), lr)
         if old:
-            self._set_moments(change(old["exp_avg"]), change(old["exp_avg_sq"]), old["step"])
+            moments = {name: change(old[name]) for name in _MOMENTS}
+            self.optimizer.state[self.logits] = {"step": old["step"], **moments}
         if given is not None:
             self._given = self._note(change(given))
 

@@ -47,13 +47,10 @@ def engine_for(
         if engine is None and name in ("auto", *ENGINES):
             engine = create_engine(name, device)
         elif engine is None:
-            raise EngineError(
-                "engine",
-                repr(name),
-                f"one of auto, {', '.join(ENGINES)}, or the name of a plugin's engine "
-                f"(plugins asked: {', '.join(plugins.answering(hook)) or 'none'})",
-                "Choose one; fragprune doctor lists plugins that failed to load.",
-            )
+            expected = f"one of auto, {', '.join(ENGINES)}, or the name of a plugin's engine "
+            expected += f"(plugins asked: {', '.join(plugins.answering(hook)) or 'none'})"
+            remedy = "Choose one; fragprune doctor lists plugins that failed to load."
+            raise EngineError("engine", repr(name), expected, remedy)
         plugins.engines[name, device] = engine
     return engine
 

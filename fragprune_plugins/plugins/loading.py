@@ -9,7 +9,6 @@ Environment: ``FRAGPRUNE_BLOCK`` and ``FRAGPRUNE_ONLY`` take comma-separated ent
 
 from __future__ import annotations
 
-import logging
 import os
 import traceback
 from collections.abc import Callable, Iterable, Iterator
@@ -21,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import pluggy
 
+from fragprune_plugins.constants import log
 from fragprune_plugins.errors import PluginError
 from fragprune_plugins.hosts.adapter import HostAdapter, HostInfo
 from fragprune_plugins.hosts.findings import Finding
@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     import torch
 
     from fragprune_plugins.engines import Engine
-
-log = logging.getLogger("fragprune")
 
 GROUP = "fragprune"
 
@@ -119,16 +117,9 @@ class Plugins:
         if not isinstance(plugin, HostAdapter):
             return
         if any(other.name == plugin.name for other in self.adapters):
-            self.findings.append(
-                Finding(
-                    "warning",
-                    "adapter-shadowed",
-                    f"adapter {plugin.name}",
-                    "offered twice; the first one is used",
-                    "one adapter per name",
-                    "Block one of the plugins.",
-                )
-            )
+            where, remedy = f"adapter {plugin.name}", "Block one of the plugins."
+            said = "offered twice; the first one is used", "one adapter per name"
+            self.findings.append(Finding("warning", "adapter-shadowed", where, *said, remedy))
             return
         self.adapters.append(plugin)
         self.adapters.sort(key=lambda each: each.name)
@@ -148,25 +139,21 @@ class Plugins:
             PluginError: a plugin raised, or its answer is wrong.
         """
         for each in self._implementations(hook):
-            answer = _call(each, hook, given)
-            if answer is None:
-                continue
-            if complaint := wrong(answer):
-                raise _broken(each.plugin_name, hook.__name__, *complaint)
-            return answer
+            if (answer := _call(each, hook, given)) is not None:
+                if complaint := wrong(answer):
+                    raise _broken(each.plugin_name, hook.__name__, *complaint)
+                return answer
         return None
 
     def tell(self, hook: Hook, **given: Any) -> None:
         """Call every observer. An observer that raises is reported and not called again."""
         for each in self._implementations(hook):
-            key = each.plugin_name, hook.__name__
-            if key in self._off:
-                continue
-            try:
-                _call(each, hook, given)
-            except PluginError as error:
-                self._off.add(key)
-                log.warning("%s Until then it is not called again.", error)
+            if (key := (each.plugin_name, hook.__name__)) not in self._off:
+                try:
+                    _call(each, hook, given)
+                except PluginError as error:
+                    self._off.add(key)
+                    log.warning("%s Until then it is not called again.", error)
 
     def answering(self, hook: Hook) -> list[str]:
         """Names of the plugins that are asked, in order."""
@@ -204,16 +191,9 @@ def load_plugins(found: Iterable[EntryPoint] | None = None) -> Plugins:
         elif entry.name not in plugins.loaded:
             _load(plugins, entry, where)
         elif entry.value != (first := plugins.loaded[entry.name]):
-            plugins.findings.append(
-                Finding(
-                    "warning",
-                    "plugin-shadowed",
-                    where,
-                    f"the name is taken by {first}",
-                    "one plugin per name",
-                    "Uninstall one of the two distributions.",
-                )
-            )
+            remedy = "Uninstall one of the two distributions."
+            said = f"the name is taken by {first}", "one plugin per name", remedy
+            plugins.findings.append(Finding("warning", "plugin-shadowed", where, *said))
     return plugins
 
 
@@ -223,15 +203,10 @@ def _load(plugins: Plugins, entry: EntryPoint, where: str) -> None:
         plugins.register(entry.load(), entry.name)
     except _FAULTS as error:  # whatever a plugin raises is its own; the others go on
         found = error.found if isinstance(error, PluginError) else _said(error)
-        plugins.findings.append(
-            Finding.error(
-                "plugin-failed",
-                where,
-                found,
-                "an adapter's class, or a module that implements known hooks",
-                "Fix it, install it again or uninstall it, or set FRAGPRUNE_BLOCK.",
-            )
-        )
+        expected = "an adapter's class, or a module that implements known hooks"
+        remedy = "Fix it, install it again or uninstall it, or set FRAGPRUNE_BLOCK."
+        finding = Finding.error("plugin-failed", where, found, expected, remedy)
+        plugins.findings.append(finding)
     else:
         plugins.loaded[entry.name] = entry.value
 

@@ -29,9 +29,6 @@ def load(point: EntryPoint, kind: type | tuple[type, ...] = object) -> Any:
     Args:
         point: of ``offered``.
         kind: what it must be an instance of.
-
-    Raises:
-        PluginError: the import failed, or gave something else. It names the package.
     """
     owner = point.dist.name if point.dist else point.value
     try:
@@ -40,10 +37,8 @@ def load(point: EntryPoint, kind: type | tuple[type, ...] = object) -> Any:
             raise TypeError(f"{point.value} is a {type(loaded).__name__}")
     except (Exception, SystemExit) as error:
         found = f"{type(error).__name__}: {error}".split("\n", 1)[0]
-        raise PluginError(
-            f"{point.group} {point.name}",
-            printable(found),
-            f"an object that {owner} offers",
-            f"Update or uninstall {owner}.",
-        ) from error
+        found = printable(found)
+        expected = f"an object that {owner} offers"
+        remedy = f"Update or uninstall {owner}."
+        raise PluginError(f"{point.group} {point.name}", found, expected, remedy) from error
     return loaded
