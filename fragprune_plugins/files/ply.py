@@ -1,13 +1,8 @@
 """Trained splats on disk: the PLY layout that all descendants of 3DGS share.
 
-One ``vertex`` element of float32 columns, values before activation: x y z, nx ny nz (zeros),
-f_dc_0..2, f_rest_0.. (channel-major: all coefficients of red, then green, then blue), opacity
-(logit), scale_0..2 (log), rot_0..3 (w x y z, any length). A model with thresholds has one column
-more, ``trunc_threshold``: the threshold itself, in falloff, in (0, 1). A model's stop is a comment
-of the header, ``fragprune stop 0.01``, and so is a soft rim, ``fragprune rim soft``. Other columns
-are ignored, and named in the log. A model with a column that changes its picture is refused
-(``columns``); with Mip-Splatting's ``filter_3D``, unless the caller draws by the rules of
-Mip-Splatting. So is one without scale_2: 2D Gaussian Splatting's, whose Gaussians are flat.
+Values before activation: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_0.. (channel-major: all of red,
+then green, then blue), opacity (logit), scale_0..2 (log), rot_0..3 (w x y z, any length). Other
+columns are ignored, and named in the log, unless they change the picture (``columns``).
 """
 
 from __future__ import annotations
@@ -30,6 +25,7 @@ from fragprune_plugins.files.reading import Reading, UntrustedFile
 from fragprune_plugins.learning.thresholds import ThresholdStore
 
 THRESHOLD_COLUMN = "trunc_threshold"
+"""Holds the thresholds themselves, in falloff, in (0, 1)."""
 
 STOP = "fragprune stop"
 """Begins the comment that holds a model's stop."""

@@ -212,15 +212,9 @@ def scene(count: int, size: tuple[int, int], extent: float) -> tuple[RasterInput
         sh=0.2 * normal(count, 16, 3),
         sh_degree=3,
     )
-    view = View.pinhole(
-        torch.eye(3),
-        torch.zeros(3),
-        width=width,
-        height=height,
-        fx=width,
-        fy=width,
-        background=torch.tensor([0.1, 0.2, 0.3]),
-    )
+    lens = {"width": width, "height": height, "fx": width, "fy": width}
+    background = torch.tensor([0.1, 0.2, 0.3])
+    view = View.pinhole(torch.eye(3), torch.zeros(3), **lens, background=background)
     return RasterInputs(view, splats), 10 ** uniform(-4.0, -0.3, count)
 
 
