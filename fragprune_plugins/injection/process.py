@@ -91,11 +91,11 @@ def surroundings(device: str) -> Iterator[None]:
         yield
 
 
-def run_main(script: Path, module: str = "") -> None:
+def run_main(script: Path, module: str) -> None:
     """Run a script as ``__main__``; returns when it ends, also by ``sys.exit(0)``.
 
     Args:
-        module: the module's name, if the script runs as ``python -m module``.
+        module: the module's name, if the script runs as ``python -m module``; else "".
 
     Raises:
         HostFailed: the script ended with another exit code.

@@ -180,9 +180,7 @@ def digest_of_sources() -> bytes:
     return digest.digest()
 
 
-def image_of(
-    source: str, macros: dict[str, int], target: str, by: Nvrtc | None = None
-) -> tuple[Image, bool]:
+def image_of(source: str, macros: dict[str, int], target: str, by: Nvrtc) -> tuple[Image, bool]:
     """A compiled source, and whether it was in the cache.
 
     Processes that need the same source at the same time wait for the first of them. If the folder
@@ -193,9 +191,8 @@ def image_of(
         target: sm_90 for machine code, compute_90 for PTX.
 
     Raises:
-        Unavailable: there is no compiler, or the source does not compile.
+        Unavailable: the source does not compile.
     """
-    by = compiler() if by is None else by
     what = repr((by.name, by.version, _OPTIONS, source, sorted(macros.items()), target))
     digest = hashlib.sha256(digest_of_sources() + what.encode()).hexdigest()[:24]
     path = cache_folder() / f"{source}-{target}-{digest}.bin"
