@@ -51,8 +51,7 @@ if TYPE_CHECKING:
 
 CHANNELS = 7
 """That are blended beside the colours in one rasterization: engines blend 8, a proof adds one."""
-SCREEN = 3
-"""Columns of the tensor that gets the screen gradient."""
+SCREEN = 3  # columns of the tensor that gets the screen gradient
 
 log = logging.getLogger("fragprune")
 
@@ -64,13 +63,13 @@ def warn_once(what: str) -> None:
 
 
 class Unread:
-    """In place of a value that the host was seen not to read."""
+    """In place of a value that the host was seen not to read, or that a proof must tell.
 
-    unread = True
-    """A proof may let the value be, whatever it is."""
+    A proof may let one be that is not read, whatever it is.
+    """
 
-    def __init__(self, name: str) -> None:
-        self.__dict__["name"] = name
+    def __init__(self, name: str, unread: bool = True) -> None:
+        self.__dict__ |= {"name": name, "unread": unread}
 
     def _raise(self, *_: Any, **__: Any) -> NoReturn:
         raise EngineError(
@@ -94,15 +93,6 @@ class Unread:
     ) -> NoReturn:
         named = (each for each in args if isinstance(each, cls))
         next(named, cls("in a list of tensors"))._raise()
-
-
-class Unproved(Unread):
-    """In place of a value that a proof must tell."""
-
-    unread = False
-
-
-IN_PLACE: dict[str, type[Unread]] = {"unread": Unread, "unproved": Unproved}
 
 
 def plane_depth(channels: Tensor, settings: Any) -> Tensor:
@@ -246,8 +236,8 @@ class ForkDialect(GraphdecoDialect):
         """The host's values in its order, with the shape and the type of its sums."""
 
         def packed(value: Output, made: Any) -> Any:
-            if value.role in IN_PLACE or made is None:  # or it was not asked for
-                return IN_PLACE.get(value.role, Unread)(value.name)
+            if value.role in ("unread", "unproved") or made is None:  # or it was not asked for
+                return Unread(value.name, unread=value.role != "unproved")
             if value.role not in ("count", "weight"):
                 return made.detach() if value.detached and value.role != "objects" else made
             made = made[:, None] if value.column else made

@@ -22,8 +22,7 @@ Role = (
 
 POSES = {"theta", "rho"}
 """Arguments that only get a camera's gradients: how it turns and moves, 0 at every call."""
-SERVED = {"dc", *POSES}
-"""Further arguments that the engines know."""
+SERVED = {"dc", *POSES}  # further arguments that the engines know
 SCREEN = re.compile(r"means2D_\w+")
 """Further tensors that get a gradient on the screen, by which Gaussians are densified."""
 

@@ -16,15 +16,13 @@ from typing import Literal
 
 from fragprune_plugins.adapting import Finding, HostRepo, nodes
 
-_DEEPEST = 6
-"""Folders below the checkout in which a rasterizer is looked for."""
+_DEEPEST = 6  # folders below the checkout in which a rasterizer is looked for
 _NOT_THEIRS = {"third_party", "build", "dist", "site-packages", "node_modules", "glm", "backward"}
 _COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/", re.DOTALL)
 _ALPHA = re.compile(r"\b(?:float|double|auto)\s+alpha\s*=([^;]+);")
 _BLENDS = re.compile(r"1(?:\.0?f?)?\s*-\s*alpha\b|\balpha\s*<\s*1")
 """What a blended alpha leaves of the light behind it, or when it is too faint to be blended."""
-_BRANCHES = re.compile(r"\balpha\s*=(?!=)([^;]+);")
-"""Of an alpha that is declared without a value."""
+_BRANCHES = re.compile(r"\balpha\s*=(?!=)([^;]+);")  # of an alpha that is declared without a value
 _JACOBIAN = re.compile(r"\bJ\s*=\s*glm::mat3(?:x3)?\s*(\([^;]+\))\s*;")
 _FILTER = re.compile(r"\bcov(?:\[0\]\[0\]|\.x)\s*\+=?\s*([\w.]+)")
 _EWA = re.compile(  # the third row is of depth: no picture has it
@@ -46,8 +44,7 @@ _LEVELS: dict[bool, tuple[Literal["error", "warning"], str]] = {
     False: ("warning", "It was not read any further; compare pictures on the first run."),
 }
 """Of what surely differs, and of what may: its level, and what to do."""
-ORDER = "order"
-"""The code of an error that is of the picture alone: a PLY is drawn in any order."""
+ORDER = "order"  # the code of an error that is of the picture alone: a PLY is drawn in any order
 
 
 @dataclass(frozen=True)

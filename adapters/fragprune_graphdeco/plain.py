@@ -28,8 +28,7 @@ from fragprune_plugins.adapting import (
     off_by_default,
 )
 
-_DEEPEST = 3
-"""Folders below a checkout in which codebases are looked for."""
+_DEEPEST = 3  # folders below a checkout in which codebases are looked for
 _COLUMNS = ("f_dc", "f_rest", "opacity", "scale", "rot")
 _PLAIN = {"x", "y", "z", "nx", "ny", "nz", "l", *_COLUMNS}
 _OF_MODEL = re.compile(

@@ -46,8 +46,7 @@ _OWN = sha256(
 ).hexdigest()
 """Another proof proves anew."""
 
-_FROM_BLACK = 1e-3
-"""Added to the constant harmonics of a host's call, far more than rounding."""
+_FROM_BLACK = 1e-3  # added to the constant harmonics of a host's call, far more than rounding
 
 _SHAPE = ("means3D", "scales", "rotations", "cov3D_precomp")
 """Arguments through which vanilla differentiates its antialiasing as if the covariance were dilated
@@ -227,7 +226,7 @@ class _Trial:
         theirs = [each.theirs[number] for each in both]
         ours = [dict(enumerate(each.ours)).get(number) for each in both]
         own, chart = both
-        said = ours[0] is None or getattr(type(ours[0]), "unread", False)
+        said = ours[0] is None or getattr(ours[0], "unread", False)
         unread = number in self.place.unread or (number < len(own.ours) and said)
         is_picture = not likeness.difference(ours[1], chart.seen.drawn.image)
         name, new = likeness.meaning(ours[1], chart.seen) or "as the adapter answers", False

@@ -25,8 +25,7 @@ from fragprune_plugins.adapting import (
     off_by_default,
 )
 
-MODEL = "scene.gaussian_model"
-"""Where 3DGS defines its model."""
+MODEL = "scene.gaussian_model"  # where 3DGS defines its model
 GETTERS = ("xyz", "opacity", "scaling", "rotation")
 """Values of a model that its properties give, by the names of their parameters."""
 _SHAPES = {"repeat", "expand", "view", "reshape", "squeeze", "unsqueeze", "contiguous"}

@@ -122,8 +122,7 @@ def _table(hosts: tuple[Path, ...], adapters: list[HostAdapter], plugins: Plugin
     return Report({"hosts": rows, "counts": counts}, "\n".join(lines))
 
 
-_NEAREST = 3
-"""Adapters that are named where none fits."""
+_NEAREST = 3  # adapters that are named where none fits
 
 _KINDS = ("fits", "several", "inside", "finetune", "never")
 
