@@ -113,12 +113,6 @@ class Fork:
         known = reading.by_default_of(self.repo, self.command, option)
         return str(known[0]) if known else None
 
-    def is_off(self, name: str) -> bool:
-        """Whether an option or an attribute of the model is None or False by default."""
-        modules = (MODEL, *self.command)
-        given = [e for each in modules for e in reading.defaults(self.repo, each, name)]
-        return bool(given) and all(map(is_off, given))
-
     def refuse(self, code: str, where: str, found: str, expected: str) -> None:
         """Add an error."""
         self.findings.append(Finding.error(code, where, found, expected))
@@ -749,7 +743,7 @@ def _stays_off(fork: Fork, function: str, value: ast.expr | None) -> bool:
     """Whether a value is None or False unless a user asks for more; every call is checked."""
     body = fork.repo.function(RENDERER, function)
     if isinstance(value, ast.Attribute):
-        return fork.is_off(value.attr)
+        return reading.off_in(fork.repo, (MODEL, *fork.command), value.attr)
     if not isinstance(value, ast.Name) or body is None:
         return is_off(value)
     names = fork.repo.parameters(RENDERER, function) or ()

@@ -516,9 +516,9 @@ class Drawing:
         option = node.test.attr if isinstance(node.test, ast.Attribute) else ""
         if option in ("", "convert_SHs_python"):
             return False
-        values = list(reading.defaults(self.repo, "arguments", option))
         made = any(text_of(each).startswith("colors_precomp = ") for each in node.body)
-        self.colours |= {option} if made and values and all(map(is_off, values)) else set()
+        if made and reading.off_in(self.repo, ("arguments",), option):
+            self.colours.add(option)
         return option in self.colours
 
     def _assign(self, target: ast.expr, value: ast.expr) -> None:

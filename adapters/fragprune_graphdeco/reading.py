@@ -536,13 +536,9 @@ def options(model: ModelClass, scripts: Iterable[str]) -> set[str]:
         and not is_off(value)
         and text_of(value).split(".")[-1] != target.attr
     }
-    return {
-        each
-        for each in asked
-        if (name := each.split(".")[-1]) not in made
-        and (given := defaults(model.repo, "arguments", name))
-        and all(map(is_off, given))
-    }
+    names = {each: each.split(".")[-1] for each in asked}
+    off = {each for each in asked if off_in(model.repo, ("arguments",), names[each])}
+    return {each for each in off if names[each] not in made}
 
 
 SCRIPTS = ("*train*.py", "*.py")
@@ -579,6 +575,12 @@ def reached(repo: HostRepo, modules: Iterable[str], without: str = "") -> dict[s
 def defaults(repo: HostRepo, module: str, name: str) -> list[ast.expr]:
     """What the classes of a module first assign to ``self.name``, and defaults of that option."""
     return _defaults(repo.tree(module)).get(name, [])
+
+
+def off_in(repo: HostRepo, modules: Iterable[str], name: str) -> bool:
+    """Whether what modules assign to ``self.name``, or to an option, is None or False at first."""
+    given = [each for module in modules for each in defaults(repo, module, name)]
+    return bool(given) and all(map(is_off, given))
 
 
 @lru_cache(maxsize=256)
