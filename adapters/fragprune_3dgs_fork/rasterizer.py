@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal
@@ -199,25 +198,20 @@ def changed_gradients(repo: HostRepo, package: str, setting: str) -> frozenset[s
     None where the picture may depend on it, or nothing was read. The Python of a vendored package
     says it: ``forward`` lists what the kernels get, ``backward`` what becomes of their gradients.
     """
-    for node in _binding(repo, package):
-        if isinstance(node, ast.ClassDef):
-            made = {each.name: each for each in node.body if isinstance(each, ast.FunctionDef)}
-            if {"forward", "backward"} <= made.keys():
-                forward, backward = made["forward"], made["backward"]
-                reads = [
-                    any(each.attr == setting for each in every(part, ast.Attribute))
-                    for part in (forward, backward)
-                ]
-                return _changed(forward, backward) if reads == [False, True] else None
-    return None
-
-
-def _binding(repo: HostRepo, package: str) -> Iterator[ast.AST]:
-    """The Python of a vendored rasterizer, through which hosts call it."""
     name = package.rpartition(".")[2]
     for folder in kernels.vendored(repo, package):
         with suppress(SyntaxError):
-            yield from ast.walk(ast.parse(repo.read(folder / name / "__init__.py")))
+            tree = ast.parse(repo.read(folder / name / "__init__.py"))
+            for node in every(tree, ast.ClassDef):
+                made = {each.name: each for each in node.body if isinstance(each, ast.FunctionDef)}
+                if {"forward", "backward"} <= made.keys():
+                    forward, backward = made["forward"], made["backward"]
+                    read, changing = (
+                        any(each.attr == setting for each in every(part, ast.Attribute))
+                        for part in (forward, backward)
+                    )
+                    return _changed(forward, backward) if changing and not read else None
+    return None
 
 
 def _changed(forward: ast.FunctionDef, backward: ast.FunctionDef) -> frozenset[str] | None:

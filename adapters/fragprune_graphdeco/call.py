@@ -129,7 +129,7 @@ def read_calls(repo: HostRepo, module: str, function: str) -> list[CallInSource]
             outputs=len(unpacked) or None,
             function=function,
             arguments=frozenset(given or ()) - set(ARGUMENTS),
-            package=imported.package(maker),
+            package=imported.called(maker)[0],
             settings=tuple(settings),
             line=place.lineno,
             names=unpacked or _taken(body, getattr(place, "id", "")),
@@ -207,13 +207,10 @@ class _Imported:
 
     def of(self, node: ast.AST | None, name: str) -> bool:
         """Whether a node calls a class of this name, or of one that a fork made of it."""
-        return name in self._called(node)[1]
+        return name in self.called(node)[1]
 
-    def package(self, node: ast.AST) -> str:
-        """The package of the class that a node calls."""
-        return self._called(node)[0]
-
-    def _called(self, node: ast.AST | None) -> tuple[str, str]:
+    def called(self, node: ast.AST | None) -> tuple[str, str]:
+        """The package and the name of the class that a node calls."""
         function = node.func if isinstance(node, ast.Call) else None
         if isinstance(function, ast.Name):
             return self.classes.get(function.id, ("an unknown package", function.id))

@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal
 
 from fragprune_plugins.adapting import Finding, HostRepo, nodes
 
@@ -39,11 +38,6 @@ _POLYNOMIAL = re.compile(r"[\w.+()-]*(?:\*[\w.+()-]+){5,}")
 _LAUNCH = re.compile(r"\b(\w+)\s*(?:<[^<>;]*>)?\s*<<\s*<")
 _KERNEL = re.compile(r"__global__[^;{(]*?(?:__launch_bounds__\s*\([^)]*\)\s*)?(\w+)\s*\(")
 _LOW_PASS = 0.3
-_LEVELS: dict[bool, tuple[Literal["error", "warning"], str]] = {
-    True: ("error", "Its pictures are not ours, so no adapter draws them."),
-    False: ("warning", "It was not read any further; compare pictures on the first run."),
-}
-"""Of what surely differs, and of what may: its level, and what to do."""
 ORDER = "order"  # the code of an error that is of the picture alone: a PLY is drawn in any order
 
 
@@ -252,11 +246,18 @@ class _Project:
     def _finding(
         self, path: Path, position: int, found: str, expected: str, *, error: bool = True
     ) -> Finding:
+        """An error for what surely differs, a warning for what may."""
         at = path.relative_to(self.repo.root).as_posix()
         if path in self.texts:
             at += f":{self.texts[path].count(chr(10), 0, position) + 1}"
-        level, remedy = _LEVELS[error]
-        return Finding(level, "kernel", f"{self.package} ({at})", found, expected, remedy)
+        where, remedy = (
+            f"{self.package} ({at})",
+            "Its pictures are not ours, so no adapter draws them.",
+        )
+        if error:
+            return Finding.error("kernel", where, found, expected, remedy)
+        remedy = "It was not read any further; compare pictures on the first run."
+        return Finding("warning", "kernel", where, found, expected, remedy)
 
 
 def _short(text: str) -> str:
