@@ -511,19 +511,13 @@ class GraphdecoAdapter(ScriptAdapter):
 
     def saved_iterations(self, output: Path) -> list[tuple[int, Path]]:
         """Checkpoints and PLYs. A host writes a checkpoint after the PLY of its iteration."""
-        plys = {
-            path: path.parent.name.removeprefix("iteration_")
-            for path in output.glob("point_cloud/iteration_*/point_cloud.ply")
-        }
-        checkpoints = {
-            path: match[1]
-            for path in output.glob("*.pth")
-            if (match := re.fullmatch(rf"(?:{self.checkpoints})(\d+)", path.stem))
-        }
+        plys = output.glob("point_cloud/iteration_*/point_cloud.ply")
+        names = {path: ("iteration_", path.parent.name) for path in plys}
+        names |= {path: (self.checkpoints, path.stem) for path in output.glob("*.pth")}
         found = [
-            (path.stat().st_mtime_ns, int(number), path in checkpoints, path)
-            for path, number in (plys | checkpoints).items()
-            if number.isdigit()
+            (path.stat().st_mtime_ns, int(number[1]), path.suffix == ".pth", path)
+            for path, (begins, name) in names.items()
+            if (number := re.fullmatch(rf"(?:{begins})(\d+)", name))
         ]
         return [(iteration, path) for _, iteration, _, path in sorted(found)]
 
