@@ -46,9 +46,6 @@ class Target:
         self.ratio = ratio
         self.met: float | None = None
 
-    def attach(self, training: Any) -> None:
-        """A training begins that is to meet it; see ``finetune.loop.Training``."""
-
     def followed(self, fragments: float) -> float:
         """The figure's ratio that a ratio of fragments brings, to steer by."""
         return fragments

@@ -33,20 +33,19 @@ _MEASURED = 5  # times at most, to meet a target
 
 
 class FrameTarget(Target):
-    """Meets a ratio of frame times: of the untruncated model as it came in, over the truncated."""
+    """Meets a ratio of frame times: of the untruncated model as it came in, over the truncated.
+
+    Args:
+        training: whose model is timed.
+    """
 
     figure: ClassVar[str] = "faster"
 
-    def __init__(self, ratio: float) -> None:
+    def __init__(self, ratio: float, training: Any = None) -> None:
         super().__init__(ratio)
-        self.training: Any = None
+        self.training = training
         self.seen = Ratios()  # by the clock, so far
         self.timed = 0  # of CLOCKED_AT
-
-    def attach(self, training: Any) -> None:
-        """Check that thresholds can reach the ratio."""
-        require_reach(self.ratio, training.start, training.dataset.train, training.engine)
-        self.training = training
 
     def measure(self, views: Sequence[Any]) -> float:
         """How many times as fast frames of these views are now."""

@@ -27,7 +27,7 @@ from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.hooks import thresholds_for
 from fragprune_plugins.plugins.loading import installed
 from fragprune_plugins.types import RasterInputs, RasterOutputs, one_line
-from fragprune_plugins.workbench.finetune.faster import FrameTarget
+from fragprune_plugins.workbench.finetune.faster import FrameTarget, require_reach
 from fragprune_plugins.workbench.finetune.losses import code_for, photometric_loss
 from fragprune_plugins.workbench.finetune.processes import Processes, SharedStage
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints, configuration
@@ -112,6 +112,10 @@ class Training:
         self.started = time.perf_counter()
         goal = settings.goal
         known = start.thresholds if goal.presses else None
+        target = None
+        if isinstance(goal, Faster):
+            require_reach(goal.ratio, start, dataset.train, engine)
+            target = FrameTarget(goal.ratio, self)
         self.stage = SharedStage(
             ThresholdStore(len(start), start.device) if known is None else known.clone(),
             settings,
@@ -120,7 +124,7 @@ class Training:
             views={shot: partial(self._draw, shot) for shot in dataset.train},
             watch=self._watched,
             parameters=self.parameters,
-            target=FrameTarget(goal.ratio) if isinstance(goal, Faster) else None,
+            target=target,
             everywhere=processes.everywhere,
         )
         rates = {"opacity": settings.opacity_lr}
@@ -140,8 +144,6 @@ class Training:
         groups = [{"params": [leaf], "name": name} for name, leaf in leaves.items()]
         self.optimizer = torch.optim.Adam(groups, eps=EPSILON)
         self._plain_first = False  # a view of this step is drawn for the first time somewhere
-        if self.stage.target is not None:
-            self.stage.target.attach(self)
         self._checkpoints = checkpoints if processes.first else None  # which writes them
         if checkpoints is not None or processes.ranks.several:
             self._go_on(checkpoints)
@@ -253,7 +255,7 @@ class Training:
                 self.between = True
                 if self.processes.may_end:
                     waiting()
-                if self.processes.keeps(self._due(self.done)):
+                if self.processes.due:
                     self.keep()
                 bar.update()
                 if self.curves and self.done % max(1, total // _POSTFIXES) == 0:
@@ -283,10 +285,6 @@ class Training:
         """All that learns, by name."""
         return {**self.parameters(), "thresholds": self.stage.store.logits}
 
-    def _due(self, step: int) -> bool:
-        """Whether it is time for a checkpoint after a step, by this process."""
-        return self._checkpoints is not None and self._checkpoints.due(step)
-
     def _step(self, shots: Sequence[Shot], waiting: DeferredSignals) -> None:
         stage = self.stage
         stage.begin(lambda: torch.sigmoid(self.model.opacity.detach()))
@@ -298,7 +296,7 @@ class Training:
             stage.on_loss(loss)
             torch.autograd.backward(loss if pressure is None else loss + pressure)
         stage.picture = ", ".join(shot.name for shot in shots)
-        due = self._due(self.done + 1)
+        due = self._checkpoints is not None and self._checkpoints.due(self.done + 1)
         self.processes.went_backward(stage, self._learned(), shots, waiting, due=due)
         for group in self.optimizer.param_groups:
             group["lr"] = stage.rate(group["name"], self.rates[group["name"]])

@@ -65,6 +65,7 @@ class Processes:
         first: this process writes files and speaks.
         divided: other processes hold other Gaussians of the model.
         may_end: a signal may end the training after this step.
+        due: it is time for a checkpoint after this step, some process says.
     """
 
     divided = False
@@ -72,7 +73,7 @@ class Processes:
 
     def __init__(self, ranks: Ranks) -> None:
         self.ranks, self.first = ranks, ranks.first
-        self._due = False  # it is time for a checkpoint, some process says
+        self.due = False
 
     def expect_able(self, settings: Settings) -> None:
         """Refuse views that cannot be divided, and times, which others would disturb."""
@@ -105,11 +106,12 @@ class Processes:
 
         ``due`` says that it is time for a checkpoint after this step, by this process.
         """
+        self.due = due
         if not self.ranks.several:
             return
         flags = [*(waiting.number == number for number in _SIGNALS), due]
         rows, leaves = stage.figures(), [*learned.values()]
-        table, (*signals, self._due) = self.exchange(leaves, rows, len(shots), flags)
+        table, (*signals, self.due) = self.exchange(leaves, rows, len(shots), flags)
         if rows:
             stage.share(shots, table)
         came = [number for number, some in zip(_SIGNALS, signals, strict=True) if some]
@@ -122,10 +124,6 @@ class Processes:
         if self.ranks.several and (last or step % _COMPARE == 0):
             known = {name: fingerprint(tensor) for name, tensor in learned.items()}
             self.ranks.agree(known, f"fine-tuning, after step {step}")
-
-    def keeps(self, due: bool) -> bool:
-        """Whether it is time for a checkpoint after this step, as all decided in it."""
-        return self._due if self.ranks.several else due
 
     def described(self, configuration: dict[str, Any]) -> dict[str, Any]:
         """What decides the result, in the words of all processes together."""

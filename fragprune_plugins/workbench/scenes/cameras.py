@@ -19,7 +19,7 @@ from fragprune_plugins.files.reading import UntrustedFile
 from fragprune_plugins.hosts.photographs import Resolution
 from fragprune_plugins.types import View
 from fragprune_plugins.workbench.scenes.dataset import read_scene
-from fragprune_plugins.workbench.scenes.pinhole import Camera
+from fragprune_plugins.workbench.scenes.pinhole import Camera, focal
 from fragprune_plugins.workbench.scenes.transforms import (
     load_json,
     matrix,
@@ -52,8 +52,8 @@ def load_cameras(path: str | Path, *, white_background: bool = False) -> list[tu
             for number, entry in enumerate(content["camera_path"]):
                 reading.place = f"camera_path[{number}]"
                 pose = [entry["camera_to_world"][at : at + 4] for at in (0, 4, 8)]
-                focal = height / (2 * math.tan(math.radians(float(entry["fov"])) / 2))
-                lens = focal, focal, width / 2, height / 2
+                length = focal(height, math.radians(float(entry["fov"])))
+                lens = length, length, width / 2, height / 2
                 camera = Camera(*opengl_pose(matrix(pose, (3, 4))), width, height, *lens)
                 cameras.append((f"{number:05d}", camera))
     elif isinstance(content, dict):

@@ -72,6 +72,11 @@ class Camera:
         )
 
 
+def focal(side: float, angle: float) -> float:
+    """The focal length of a camera that sees a side of its picture under an angle, radians."""
+    return side / (2 * math.tan(angle / 2))
+
+
 def check_pose(rotation: Tensor, translation: Tensor) -> None:
     """Raise InputError unless it is a rotation, and a place within ``DISTANCE_MAX``."""
     require_tensor("rotation", rotation, 3, 3)
@@ -128,13 +133,13 @@ def look_at(
         )
     right = torch.nn.functional.normalize(right, dim=0)
     rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
-    focal = height / (2 * math.tan(math.radians(fov_y) / 2))
+    length = focal(height, math.radians(fov_y))
     return View.pinhole(
         rotation.float(),
         (-rotation @ at).float(),
         width=width,
         height=height,
-        fx=focal,
-        fy=focal,
+        fx=length,
+        fy=length,
         background=background,
     )

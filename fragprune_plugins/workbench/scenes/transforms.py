@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.files.reading import MEBIBYTE, UntrustedFile
 from fragprune_plugins.workbench.scenes.images import find_image, image_size
 from fragprune_plugins.workbench.scenes.lenses import Lens
+from fragprune_plugins.workbench.scenes.pinhole import focal
 from fragprune_plugins.workbench.scenes.posed import Posed, split
 
 PAIR = ("transforms_train.json", "transforms_test.json")
@@ -129,14 +129,9 @@ def _row(folder: Path, frame: dict[str, Any], images: str) -> Posed:
     listed = Path(frame["file_path"])
     image = find_image(folder / (listed if images == "images" else Path(images) / listed.name))
     width, height = (int(frame["w"]), int(frame["h"])) if "w" in frame else image_size(image)
-    if "fl_x" in frame:
-        fx = float(frame["fl_x"])
-    else:
-        fx = width / (2 * math.tan(float(frame["camera_angle_x"]) / 2))
-    if "camera_angle_y" in frame:
-        fy = height / (2 * math.tan(float(frame["camera_angle_y"]) / 2))
-    else:
-        fy = fx
+    known = "fl_x" in frame
+    fx = float(frame["fl_x"]) if known else focal(width, float(frame["camera_angle_x"]))
+    fy = focal(height, float(frame["camera_angle_y"])) if "camera_angle_y" in frame else fx
     usual = {"fl_y": fy, "cx": width / 2, "cy": height / 2}
     fy, cx, cy = (float(frame.get(name, number)) for name, number in usual.items())
     fisheye, coefficients = _distortion(frame)

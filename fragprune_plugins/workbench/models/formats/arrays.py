@@ -26,9 +26,6 @@ SH_C0 = 0.28209479177387814
 
 _ALPHA_EDGE = 1e-6  # an 8-bit opacity of 0 or 255 has no finite logit
 
-PER_BYTE = 1
-"""Most Gaussians that a byte of a compressed file may stand for; of scenes it is a tenth of one."""
-
 log = logging.getLogger("fragprune")
 
 
@@ -192,6 +189,9 @@ def take(stream: Any, count: int) -> bytes:
 
 
 def expect_plausible(count: int, size: int) -> None:
-    """Raise ValueError if so many bytes cannot hold the positions of so many Gaussians."""
-    if not 0 < count <= size * PER_BYTE:
+    """Raise ValueError if so many bytes cannot hold the positions of so many Gaussians.
+
+    A byte of a compressed file stands for one at most; of scenes, for a tenth of one.
+    """
+    if not 0 < count <= size:
         raise ValueError(f"{count} Gaussians in {size} bytes")
