@@ -11,7 +11,7 @@ from PIL import Image
 
 from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.workbench.scenes.dataset import load_dataset
-from fragprune_plugins.workbench.scenes.lenses import Lens
+from fragprune_plugins.workbench.scenes.posed import Lens
 
 WIDTH, HEIGHT = 96, 64
 EYE, ORIGIN = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)

@@ -16,8 +16,7 @@ from torch import Tensor
 from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.files.reading import Reading, UntrustedFile
 from fragprune_plugins.workbench.scenes.images import find_image
-from fragprune_plugins.workbench.scenes.lenses import Lens
-from fragprune_plugins.workbench.scenes.posed import Posed, split
+from fragprune_plugins.workbench.scenes.posed import Lens, Posed, split
 
 NERFSTUDIOS = Path("colmap", "sparse", "0")
 

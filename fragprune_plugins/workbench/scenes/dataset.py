@@ -22,14 +22,13 @@ from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.types import View, one_line
 from fragprune_plugins.workbench.scenes import colmap, transforms
 from fragprune_plugins.workbench.scenes.images import SUFFIXES, image_size, opened
-from fragprune_plugins.workbench.scenes.lenses import Lens
 from fragprune_plugins.workbench.scenes.pinhole import Camera
-from fragprune_plugins.workbench.scenes.posed import Posed
+from fragprune_plugins.workbench.scenes.posed import Lens, Posed
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-    from fragprune_plugins.workbench.scenes.lenses import Pixels
+    from fragprune_plugins.workbench.scenes.posed import Pixels
 
 _ASPECT_TOLERANCE = 0.01
 OFF_CENTRE = 0.5  # pixels

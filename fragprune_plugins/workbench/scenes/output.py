@@ -101,7 +101,12 @@ def _arguments(model: Path) -> tuple[Photographs, bool] | None:
     if folder is None or not (folder / ARGUMENTS).exists():
         return None
     with _FILE.reading(folder / ARGUMENTS) as reading:
-        call = _call(reading.text())
+        tree = parsed(reading.text().strip())
+        match tree.body if tree else []:
+            case [ast.Expr(value=ast.Call(func=ast.Name(id="Namespace")) as call)]:
+                pass
+            case _:
+                raise ValueError("no Namespace(...)")
         values: dict[str, Any] = {}
         for word in call.keywords:
             if word.arg in _READ:
@@ -130,12 +135,3 @@ def over_white(model: Path) -> bool:
         known = _arguments(model)
         return bool(known and known[0].white_background)
     return False
-
-
-def _call(text: str) -> ast.Call:
-    """The Namespace that a text is."""
-    tree = parsed(text.strip())
-    match tree.body if tree else []:
-        case [ast.Expr(value=ast.Call(func=ast.Name(id="Namespace")) as call)]:
-            return call
-    raise ValueError("no Namespace(...)")

@@ -1,14 +1,25 @@
-"""Photographs of a scene before they are read, and which of them are held out."""
+"""Photographs of a scene before they are read, with their lenses; and which are held out.
+
+OpenCV straightens photographs: cameras have lens distortion, rasterization has none.
+"""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
-from fragprune_plugins.workbench.scenes.lenses import Lens
+import numpy as np
+
+from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.workbench.scenes.pinhole import Camera
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    Pixels = np.ndarray[Any, np.dtype[np.uint8]]
 
 log = logging.getLogger("fragprune")
 
@@ -16,6 +27,103 @@ Item = TypeVar("Item")
 
 HOLD_OUT = 8
 """Views 0, 8, 16, ... of the sorted names are held out (hosts' llffhold)."""
+
+_COEFFICIENTS_MAX = 1e3  # of a real lens they are below 1
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A lens by OpenCV's models, in COLMAP's pixel convention.
+
+    Attributes:
+        width, height: pixels of the photograph that the numbers belong to.
+        fx, fy: focal lengths, pixels.
+        cx, cy: principal point, pixels; 0.5 is the middle of the first pixel.
+        coefficients: k1, k2, p1, p2, k3, k4, k5, k6; of a fisheye k1, k2, k3, k4.
+        fisheye: whether the model is OpenCV's (and COLMAP's) fisheye.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    coefficients: tuple[float, ...]
+    fisheye: bool = False
+
+    def __post_init__(self) -> None:
+        if len(self.coefficients) != (4 if self.fisheye else 8):
+            raise ValueError(f"{len(self.coefficients)} coefficients of distortion")
+        if not all(abs(each) < _COEFFICIENTS_MAX for each in self.coefficients):
+            raise ValueError(f"the coefficients of distortion {list(self.coefficients)}")
+
+    @property
+    def straight(self) -> bool:
+        """Whether the lens is a pinhole's."""
+        return not self.fisheye and not any(self.coefficients)
+
+    def camera(self, rotation: Tensor, translation: Tensor) -> Camera:
+        """The pinhole camera at this pose whose photograph ``straighten`` makes.
+
+        It has as many pixels, and sees as much as it can without a pixel that the photograph lacks.
+        """
+        own = self._camera(rotation, translation)
+        if self.straight:
+            return own
+        cv2, size = _opencv(), (self.width, self.height)
+        matrix, bend = _matrix(own), np.array(self.coefficients)
+        if self.fisheye:
+            found = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
+                matrix, bend, size, np.eye(3), balance=0.0
+            )
+        else:
+            found, _ = cv2.getOptimalNewCameraMatrix(matrix, bend, size, alpha=0)
+        fx, fy, cx, cy = (float(found[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        return Camera(rotation, translation, *size, fx, fy, cx + 0.5, cy + 0.5)
+
+    def _camera(self, rotation: Tensor, translation: Tensor) -> Camera:
+        """The camera of the photograph itself, without its distortion."""
+        numbers = (self.width, self.height, self.fx, self.fy, self.cx, self.cy)
+        return Camera(rotation, translation, *numbers)
+
+    def straighten(self, pixels: Pixels, camera: Camera) -> Pixels:
+        """A photograph (H, W, channels), of any size with the lens's aspect, as ``camera`` sees it.
+
+        The latter is what the method of that name gave, of any size with that aspect.
+        """
+        cv2 = _opencv()
+        height, width = pixels.shape[:2]
+        seen = _matrix(camera.resized(width, height))
+        here = self._camera(camera.rotation, camera.translation).resized(width, height)
+        make = cv2.fisheye.initUndistortRectifyMap if self.fisheye else cv2.initUndistortRectifyMap
+        bend, size = np.array(self.coefficients), (width, height)
+        maps = make(_matrix(here), bend, np.eye(3), seen, size, cv2.CV_32FC1)
+        straight: Pixels = cv2.remap(
+            pixels, *maps, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        return straight.reshape(pixels.shape)
+
+
+def _matrix(camera: Camera) -> np.ndarray[Any, Any]:
+    """Intrinsics as OpenCV has them, where 0 is the middle of the first pixel."""
+    return np.array(
+        [[camera.fx, 0.0, camera.cx - 0.5], [0.0, camera.fy, camera.cy - 0.5], [0.0, 0.0, 1.0]]
+    )
+
+
+def _opencv() -> Any:
+    try:
+        import cv2
+    except ImportError as error:
+        raise DatasetError(
+            "lens",
+            "lens distortion, and OpenCV is not installed",
+            "undistorted images, or OpenCV to undistort them",
+            "pip install 'fragprune-plugins[undistort]', or undistort them first "
+            "(colmap image_undistorter).",
+        ) from error
+    return cv2
 
 
 class Posed(NamedTuple):

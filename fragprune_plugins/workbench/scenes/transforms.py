@@ -11,9 +11,8 @@ import torch
 from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.files.reading import MEBIBYTE, UntrustedFile
 from fragprune_plugins.workbench.scenes.images import find_image, image_size
-from fragprune_plugins.workbench.scenes.lenses import Lens
 from fragprune_plugins.workbench.scenes.pinhole import focal
-from fragprune_plugins.workbench.scenes.posed import Posed, split
+from fragprune_plugins.workbench.scenes.posed import Lens, Posed, split
 
 PAIR = ("transforms_train.json", "transforms_test.json")
 SINGLE = "transforms.json"
