@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -44,7 +44,7 @@ class FrameTarget(Target):
     def __init__(self, ratio: float, training: Any = None) -> None:
         super().__init__(ratio)
         self.training = training
-        self.seen = Ratios()  # by the clock, so far
+        self.seen: list[tuple[float, float]] = []  # logarithms of fragments' ratios, and of times'
         self.timed = 0  # of CLOCKED_AT
 
     def measure(self, views: Sequence[Any]) -> float:
@@ -54,22 +54,22 @@ class FrameTarget(Target):
 
     def followed(self, fragments: float) -> float:
         """The ratio of frame times that a ratio of fragments brings, by what was timed so far."""
-        return float(fragments ** self.seen.slope(self.ratio))
+        return float(fragments ** self.slope())
 
     def look(self, progress: float, ratio: Callable[[], float], views: Sequence[Any]) -> None:
         """Time frames, at some shares of the learning."""
         passed = sum(progress >= share for share in CLOCKED_AT)
         if self.timed < passed:
             self.timed = passed
-            self.seen.add(ratio(), self.measure(views))
+            self.note(ratio(), self.measure(views))
 
     def meet(self, store: ThresholdStore, ratio: Callable[[], float], views: Sequence[Any]) -> None:
         """Shift all thresholds onto the target, by predictions that measurements correct."""
         for _ in range(_MEASURED):
-            aim = self.ratio ** (1 / self.seen.slope(self.ratio))
+            aim = self.ratio ** (1 / self.slope())
             fragments = calibrate(store, ratio, aim, tolerance=_NEAR / 4)
             self.met = self.measure(views)
-            self.seen.add(fragments, self.met)
+            self.note(fragments, self.met)
             if abs(self.met / self.ratio - 1) <= _NEAR:
                 break
 
@@ -77,34 +77,22 @@ class FrameTarget(Target):
         """Also what was timed."""
         return super().state() | {"seen": list(self.seen), "timed": self.timed}
 
-    def load_state(self, state: Mapping[str, Any]) -> None:
-        """Take over what ``state`` gave, as its base does."""
-        super().load_state(state)
-        self.seen = Ratios(self.seen)
-
-
-class Ratios(list[tuple[float, float]]):
-    """Logarithms of ratios of fragments, and of frame times.
-
-    Both ratios are 1 without truncation, so that their logarithms are taken as proportional. The
-    slope is fitted to all of them, in which noise cancels; those near the target weigh most.
-    """
-
-    def add(self, fragments: float, measured: float) -> None:
+    def note(self, fragments: float, measured: float) -> None:
         """Take a pair of ratios in, unless it is too near 1 to tell a slope from noise."""
         if 1 + _NEAR < fragments < math.inf and measured > 1 + _NEAR:
-            self.append((math.log(fragments), math.log(measured)))
+            self.seen.append((math.log(fragments), math.log(measured)))
 
-    def slope(self, target: float) -> float:
-        """ln(measured) / ln(fragments) near a target, 0.1 to 1.5.
+    def slope(self) -> float:
+        """ln(frame times) / ln(fragments) near the target, 0.1 to 1.5; a rough one at first.
 
-        Before anything was measured, what it is roughly.
+        Both ratios are 1 without truncation, so that their logarithms are taken as proportional.
+        The slope is fitted to all, in which noise cancels; those near the target weigh most.
         """
-        weights = [1 / (_NEAR**2 + (m - math.log(target)) ** 2) for _, m in self]
-        squares = sum(w * p * p for w, (p, _) in zip(weights, self, strict=True))
+        weights = [1 / (_NEAR**2 + (m - math.log(self.ratio)) ** 2) for _, m in self.seen]
+        squares = sum(w * p * p for w, (p, _) in zip(weights, self.seen, strict=True))
         if squares == 0:
             return TIME_FOLLOWS
-        products = sum(w * p * m for w, (p, m) in zip(weights, self, strict=True))
+        products = sum(w * p * m for w, (p, m) in zip(weights, self.seen, strict=True))
         return min(max(products / squares, 0.1), 1.5)
 
 
