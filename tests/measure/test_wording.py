@@ -59,6 +59,12 @@ def test_noise_is_noise_whichever_of_the_two_comes_first():
         assert "no difference beyond the noise" in gain(*pair)
 
 
+def test_a_factor_whose_error_exceeds_it_is_not_claimed():
+    slow, unsure = measured(20, 42.92, 30, 5.05), measured(20, 3.04, 30, 6.26)
+    for pair in ((slow, unsure), (unsure, slow)):
+        assert "no difference beyond the noise" in gain(*pair)
+
+
 @pytest.mark.parametrize(
     ("was", "now", "said", "figure"),
     [

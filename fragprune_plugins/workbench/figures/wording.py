@@ -373,9 +373,11 @@ def frames(before: dict[str, Any], after: dict[str, Any], enlarge: int = 1) -> s
 
 def _faster(before: dict[str, Any], after: dict[str, Any]) -> tuple[float, float, bool]:
     """How many times as fast frames are, its standard error, and whether that is a difference."""
-    ratio = before["frame_ms"] / max(after["frame_ms"], 1e-9)
-    errors = (report["frame_ms_se"] / max(report["frame_ms"], 1e-9) for report in (before, after))
-    error = ratio * math.hypot(*errors)
-    # Of the difference, not of the ratio: which of the two comes first must not decide.
-    noise = CLAIMED * math.hypot(before["frame_ms_se"], after["frame_ms_se"])
-    return ratio, error, abs(before["frame_ms"] - after["frame_ms"]) > noise
+    times = [max(report["frame_ms"], 1e-9) for report in (before, after)]
+    errors = [report["frame_ms_se"] for report in (before, after)]
+    ratio = times[0] / times[1]
+    relative = math.hypot(*(error / time for error, time in zip(errors, times, strict=True)))
+    # Of the difference and of the logarithm, not of the ratio: which of the two comes first must
+    # not decide. Where the shorter time is unsure, the difference alone would claim any factor.
+    differs = abs(times[0] - times[1]) > CLAIMED * math.hypot(*errors)
+    return ratio, ratio * relative, differs and abs(math.log(ratio)) > CLAIMED * relative
