@@ -61,25 +61,22 @@ REASONS = ("behind what is opaque", "at the rim, beyond 2 sigma", "of faint Gaus
 
 AS_IT_IS = "as it is"
 UNTRUNCATED = "without its cutoffs and stop"
+HONOURING = "a viewer that knows its cutoffs"
 
 _COUNTS = ("fragments_per_pixel", "evaluated_per_pixel")
 
 
 @dataclass
 class Idle:
-    """Counts of weighed fragments: drawn at some pixels, and of them idle alone and together.
-
-    Attributes:
-        weight: of those idle together, sum; a pixel has 1 at most.
-        reasons: (2, 4) all, and those idle together, by ``REASONS``.
-    """
+    """Counts of weighed fragments: drawn at some pixels, and of them idle alone and together."""
 
     __repr__ = one_line
 
     pixels: int = 0
     alone: int = 0
-    weight: float = 0.0
+    weight: float = 0.0  # of those idle together, sum; a pixel has 1 at most
     reasons: Tensor = field(default_factory=lambda: torch.zeros(2, 4, dtype=torch.int64))
+    """(2, 4) all, and those idle together, by ``REASONS``."""
 
     def add(self, tile: Weighed) -> None:
         """Count the fragments of a tile."""
@@ -109,31 +106,19 @@ class Idle:
 
 @dataclass(frozen=True)
 class Weighed:
-    """K Gaussians at the P pixels of a tile; all (K, P).
-
-    Attributes:
-        drawn: whether there is a fragment.
-        weights: T alpha.
-        alone, together: whether it is idle.
-        reasons: index into ``REASONS``.
-    """
+    """K Gaussians at the P pixels of a tile; all (K, P)."""
 
     __repr__ = one_line
 
-    drawn: Tensor
-    weights: Tensor
-    alone: Tensor
+    drawn: Tensor  # whether there is a fragment
+    weights: Tensor  # T alpha
+    alone: Tensor  # whether it is idle
     together: Tensor
-    reasons: Tensor
+    reasons: Tensor  # index into ``REASONS``
 
 
 def weigh(tile: Any, background: Tensor) -> Weighed:
-    """Judge the fragments of a tile, front to back.
-
-    Args:
-        tile: of ``engines.reference.fragments``; K is 1 or more.
-        background: (3,) RGB.
-    """
+    """Judge a tile's K fragments, 1 or more, front to back, before a background (3,)."""
     alpha, light, drawn = tile.alpha, tile.light, tile.drawn
     weights = alpha * light
     left = light[-1] * (1 - alpha[-1])
@@ -160,20 +145,14 @@ def weigh(tile: Any, background: Tensor) -> Weighed:
 
 @dataclass(frozen=True)
 class Shown:
-    """A view whose pictures are kept.
-
-    Attributes:
-        image: (3, H, W).
-        fragments: (H, W) drawn per pixel.
-        overdraw: (H, W) ellipses of sqrt(8) standard deviations over each pixel.
-    """
+    """A view whose pictures are kept."""
 
     __repr__ = one_line
 
     name: str
-    image: Tensor
-    fragments: Tensor
-    overdraw: Tensor
+    image: Tensor  # (3, H, W)
+    fragments: Tensor  # (H, W) drawn per pixel
+    overdraw: Tensor  # (H, W) ellipses of sqrt(8) standard deviations over each pixel
 
 
 @torch.no_grad()
@@ -186,11 +165,9 @@ def audit(
     repeats: int = REPEATS,
     progress: bool = False,
 ) -> tuple[dict[str, Any], list[Shown]]:
-    """Measure what a splat costs from some cameras.
+    """Measure what a splat, with its thresholds and stop, costs from cameras on its device.
 
     Args:
-        model: N Gaussians, drawn with their thresholds and stop where they have some.
-        views: the cameras with their names, on the model's device.
         tiles: of all views together, whose fragments are weighed one by one.
         repeats: timed frames of each timed view and cut.
 
@@ -200,7 +177,7 @@ def audit(
     survey = _Survey(model, engine)
     chosen = _middles(len(views))
     each = max(1, tiles // len(views))
-    steps = each + 1  # of a view: the pictures, then the tiles, of which small ones have fewer
+    steps = each + 1  # of a view: pictures, then tiles, of which small ones have fewer
     with tqdm(total=steps * len(views), desc="audit", unit="tile", disable=not progress) as bar:
         for number, (name, view) in enumerate(views):
             survey.draw(name, view, shown=number in chosen)
@@ -227,7 +204,7 @@ class _Survey:
         self._idle = Idle()
 
     def draw(self, name: str, view: View, shown: bool) -> None:
-        """Draw a view of the model and of its cuts; if ``shown``, pictures show it."""
+        """Draw a view of the model and of its cuts."""
         engine, opacities, itself = self._engine, self._itself.splats.opacities, None
         for label, candidate in self.candidates.items():
             out = candidate.draw(engine, view, counts=itself is None)
@@ -287,9 +264,6 @@ def _middles(count: int) -> list[int]:
     """Some evenly spread numbers, the middle ones of as many parts: an orbit begins at a pole."""
     parts = min(SHOWN, count)
     return [(2 * part + 1) * count // (2 * parts) for part in range(parts)]
-
-
-HONOURING = "a viewer that knows its cutoffs"
 
 
 def _candidates(model: Model) -> dict[str, Candidate]:

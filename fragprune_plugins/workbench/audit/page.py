@@ -40,11 +40,9 @@ _KINDS = ("", "_fragments", "_overdraw")
 
 
 def draw(folder: Path, shown: Sequence[Shown]) -> dict[str, Any]:
-    """Write the pictures of the shown views, one pixel for each of the view's.
+    """Write the pictures of the shown views; returns what the page says of them.
 
-    Returns:
-        limit: the count at the top of the scale of all maps; views: name, width, height and
-        files (picture, fragments, overdraw) of each.
+    "limit" is the count at the top of the scale of all maps.
     """
     limit = shared_limit([each for view in shown for each in (view.fragments, view.overdraw)])
     views = []
@@ -130,11 +128,7 @@ def _folded(table: page.Table) -> list[str]:
 
 
 def compose(figures: Mapping[str, Any], folder: Path) -> str:
-    """The page as HTML, with its pictures inside.
-
-    Args:
-        figures: of ``audit``, with "model", "cameras" and "maps".
-    """
+    """The page as HTML, with its pictures, of the figures of ``audit``, inside."""
     cuts, viewers, idle = _tables(figures)
     return page.render(
         _TEMPLATE,

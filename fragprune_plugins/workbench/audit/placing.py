@@ -47,28 +47,22 @@ _AHEAD = ((1, 0, 0), (-1, 0, 0), (0, 0, 1), (0, 0, -1), (0, 1, 0.01), (0, -1, 0.
 
 @dataclass(frozen=True)
 class Placed:
-    """Cameras that were placed, and why there.
-
-    Attributes:
-        side: "orbit" or "inside".
-        enclosed: share of directions that end on a surface, from the best place; None if no place
-            was looked for.
-    """
+    """Cameras that were placed, and why there."""
 
     views: Named
-    side: str
+    side: str  # "orbit" or "inside"
     why: str
     enclosed: float | None = None
+    """Share of directions that end on a surface, from the best place; None: none was looked for."""
 
 
 @torch.no_grad()
 def place(
     splat: Model, count: int, engine: Engine, *, side: Side = "auto", divide: int = 1
 ) -> Placed:
-    """Cameras all around a splat, or inside of it.
+    """Cameras all around a splat, or inside of it, by small pictures that an engine draws.
 
     Args:
-        engine: draws small pictures to choose by.
         divide: divisor of the sides of their pictures, which have 800 pixels.
     """
     pixels = 800 // divide
@@ -148,16 +142,14 @@ def _clear(splat: Model, radius: float) -> list[Tensor]:
 
 
 def enclosed(engine: Engine, splats: Splats, place: Tensor, near: float) -> float:
-    """Share of directions from a place that end on something opaque beyond a distance.
+    """Share of directions from a place (3,) that end on something opaque beyond a distance.
 
     A pixel's distance is the harmonic mean of its fragments' by weight: a large Gaussian in front
     of the camera, however thin, brings it near.
-
-    Args:
-        place: (3,).
-        near: the distance, world units.
     """
-    angles = _solid_angles()
+    at = (torch.arange(_PIXELS) + 0.5) / _PIXELS * 2 - 1
+    # What a pixel of such a view sees of the sphere, up to a factor.
+    angles = (1 + at[:, None] ** 2 + at**2).pow(-1.5).flatten()
     met = [float((_met(engine, splats, view, near) * angles).sum()) for view in _faces(place)]
     return sum(met) / (len(met) * float(angles.sum()))
 
@@ -173,9 +165,3 @@ def _faces(place: Tensor) -> list[View]:
     eye = place.double().cpu()
     square: dict[str, Any] = {"width": _PIXELS, "height": _PIXELS, "fov_y": 90}
     return [look_at(eye, eye + eye.new_tensor(ahead), **square) for ahead in _AHEAD]
-
-
-def _solid_angles() -> Tensor:
-    """(_PIXELS^2,) what a pixel of such a view sees of the sphere, up to a factor."""
-    at = (torch.arange(_PIXELS) + 0.5) / _PIXELS * 2 - 1
-    return (1 + at[:, None] ** 2 + at**2).pow(-1.5).flatten()

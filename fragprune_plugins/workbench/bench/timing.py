@@ -28,22 +28,15 @@ TRUNCATION = 16 / 255
 
 @dataclass(frozen=True)
 class Case:
-    """A rasterization to time.
-
-    Attributes:
-        view: the camera, on the Gaussians' device.
-        splats: activated Gaussians; their device does the work.
-        kind: forward only, or with every gradient.
-        thresholds: (N,) or None.
-        rules: ``Model.rules`` to draw by.
-    """
+    """A rasterization to time."""
 
     scene: str
-    view: View
+    view: View  # on the Gaussians' device, which does the work
     splats: Splats
     kind: Pass
     thresholds: Tensor | None = None
     rules: Mapping[str, Any] = field(default_factory=dict)
+    """``Model.rules`` to draw by."""
 
     __repr__ = one_line
 
@@ -56,12 +49,7 @@ class Case:
 def cases(
     scene: str, view: View, splats: Splats, cut: Tensor, rules: Mapping[str, Any]
 ) -> list[Case]:
-    """Both passes of a scene, each without truncation and then with.
-
-    Args:
-        cut: (N,) thresholds of truncated rows.
-        rules: ``Model.rules`` to draw truncated rows by.
-    """
+    """Both passes of a scene, each without truncation, and then with thresholds (N,) and rules."""
     plain = [Case(scene, view, splats, kind) for kind in PASSES]
     return [each for case in plain for each in (case, replace(case, thresholds=cut, rules=rules))]
 
@@ -78,16 +66,14 @@ def measure(
     On a GPU the clock stops when it is idle again, after the backward pass too.
 
     Args:
-        engines: the engines to time. Pictures are compared with those of the first engine.
+        engines: pictures are compared with those of the first one.
         repeats: number of rounds after one warm-up round.
 
     Returns:
-        One dict a case and engine: scene, width, height, gaussians, pass, engine, device, threads,
-        truncated, fragments_per_pixel, evaluated_per_pixel, ms_median, ms_min, ms_se,
-        ns_per_fragment (of the median; None where nothing is drawn), stages (medians in ms),
-        peak_mb (beyond inputs, of a GPU's own memory as torch gives it out, else of main memory;
-        None where the system cannot tell), difference (mean absolute, from the first engine's
-        picture).
+        One dict a case and engine; with stages (medians in ms), ns_per_fragment (of the median;
+        None where nothing is drawn), peak_mb (beyond inputs, of a GPU's own memory as torch gives
+        it out, else of main memory; None where the system cannot tell), difference (mean absolute,
+        from the first engine's picture).
     """
     jobs = [(case, engine, _prepare(case, engine)) for case in cases for engine in engines]
     times: list[list[float]] = [[] for _ in jobs]
@@ -192,12 +178,7 @@ def _status(field: str) -> float:
 
 
 def describe_machine(device: torch.device | str = "cpu") -> dict[str, Any]:
-    """The processor, and the versions that decide about speed.
-
-    Returns:
-        processor, cores, platform, torch, native (build of the cpu engine, or None), gpu (name of
-        the device, None for the CPU).
-    """
+    """The processor, and the versions that decide about speed."""
     device = torch.device(device)
     native = binding.chosen()
     return {
@@ -205,7 +186,7 @@ def describe_machine(device: torch.device | str = "cpu") -> dict[str, Any]:
         "cores": os.cpu_count(),
         "platform": platform.platform(),
         "torch": torch.__version__,
-        "native": native.build if isinstance(native, binding.Library) else None,
+        "native": native.build if isinstance(native, binding.Library) else None,  # cpu engine
         "gpu": torch.cuda.get_device_name(device) if device.type == "cuda" else None,
     }
 

@@ -28,9 +28,7 @@ _PICTURE: dict[str, Any] = {"width": 1280, "height": 720, "fov_y": 50.0}
 def orbit(splat: Model, count: int, up: tuple[float, float, float]) -> Named:
     """Cameras once around a splat, from ``overview``'s height and distance, evenly spaced.
 
-    Args:
-        count: cameras; the one after the last would be the first.
-        up: (3,) what is up in its world.
+    The one after the last would be the first.
     """
     first = overview(splat, up, **_PICTURE)
     centre, _ = bounds(splat)
@@ -49,9 +47,7 @@ def orbit(splat: Model, count: int, up: tuple[float, float, float]) -> Named:
 def along(cameras: Named, count: int) -> Named:
     """Cameras on the way through given ones, in their order, at an even pace from one to the next.
 
-    Args:
-        cameras: the given ones. The pictures have the size and lens of the first.
-        count: of the result, from the first to the last.
+    The pictures have the size and lens of the first.
     """
     views = [moved(cameras[0][1], view.viewmatrix, view.campos) for _, view in cameras]
     found = []
@@ -101,9 +97,8 @@ def write_mp4(path: Path, frames: Iterable[Tensor], fps: int) -> None:
             if writer is not None:
                 writer.close()
                 opening = ["-v", "error", "-i", str(temporary), "-t", "0", "-f", "null", "-"]
-                opened = subprocess.run(
-                    [encoder.get_ffmpeg_exe(), *opening], stdin=subprocess.DEVNULL
-                )
+                words = [encoder.get_ffmpeg_exe(), *opening]
+                opened = subprocess.run(words, stdin=subprocess.DEVNULL)
                 if opened.returncode:  # the writer does not say how it ended
                     raise OSError("it cannot be opened")
         except OSError as error:

@@ -40,32 +40,21 @@ _GREY = "#888888"  # can be read on white and on black
 
 @dataclass(frozen=True)
 class Shown:
-    """A view that was drawn for a page.
-
-    Attributes:
-        size: of its photograph: width and height, pixels.
-        fragments: drawn per pixel, of each model.
-    """
+    """A view that was drawn for a page."""
 
     name: str
-    size: page.Size
-    fragments: tuple[str, str]
+    size: page.Size  # of its photograph
+    fragments: tuple[str, str]  # drawn per pixel, of each model
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """Views that were drawn for a page, on shared scales.
-
-    Attributes:
-        target: what they were compared with: "Photograph", or the model's own picture.
-        most_fragments: per pixel, at the top of the scale.
-        most_error: difference to the photograph at the top of the scale, 8-bit levels.
-    """
+    """Views that were drawn for a page, on shared scales."""
 
     views: Sequence[Shown]
-    target: str
-    most_fragments: float
-    most_error: float
+    target: str  # what they were compared with, in words
+    most_fragments: float  # per pixel, at the top of the scale
+    most_error: float  # likewise, the difference to the photograph in 8-bit levels
 
     @property
     def files(self) -> list[str]:
@@ -86,7 +75,6 @@ def compose(
 
     Args:
         template: ``TEMPLATE``, or one that extends it.
-        drawn: the views that ``draw_views`` drew; None where there are none.
         source: turns a picture's file name into its ``src``, a relative path or a data URL.
         labels: what people read for the two models.
         values: title; facts, (number, words) of each; quote, a sentence; seen, whether the training
@@ -113,10 +101,9 @@ def draw_views(
 
     Args:
         folder: for the PNGs, which ``Drawn.files`` names.
-        shots: the views; they move to the models' device.
         enlarge: how many times as wide and high as the photograph both models are drawn.
     """
-    chosen = [shot.to(original.model.xyz.device) for shot in evenly_spaced(shots, SHOWN)]
+    chosen = [shot.to(original.model.device) for shot in evenly_spaced(shots, SHOWN)]
     names = stems([shot.name for shot in chosen])
     maps: dict[str, dict[str, Tensor]] = {"fragments": {}, "error": {}}
     views = []
@@ -145,11 +132,7 @@ def draw_views(
 
 
 def save_banner(path: Path, folder: Path, drawn: Drawn) -> None:
-    """Write one view and its fragments side by side, left of a line the original, right the pruned.
-
-    Args:
-        drawn: what it gave; the first view is taken.
-    """
+    """Write the first view and its fragments, left of a line the original, right the pruned."""
     view = drawn.views[0]
     first, second = view.fragments
     halves = []

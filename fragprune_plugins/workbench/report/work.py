@@ -53,18 +53,14 @@ def report(*, folder: Path, out: Path | None, data: Path | None, engine: EngineO
     pruned = [record for record in results if _goal(record) not in (None, CONTROL)]
     main = [*every, *results, *pruned][-1]
     control = _goal(main) == CONTROL
-    others = [record for record in every if record is not main]
     files = [record.path for record in every]
     line = _sentence(main, files)
     with TemporaryDirectory() as name:
         pictures = Path(name)
         drawn, learning, missing = _draw(main, folder, pictures, data, partial(open_engine, engine))
         more = [*learning, *_files(every, folder, pictures)]
-        notes = [
-            *_begun(main),
-            *([_ONLY_CONTROLS] if control else []),
-            *([missing] if missing else []),
-        ]
+        notes = [*_begun(main), _ONLY_CONTROLS if control else "", missing]
+        notes = [note for note in notes if note]
         text = report_page.compose(
             report_page.TEMPLATE,
             drawn,
@@ -78,12 +74,9 @@ def report(*, folder: Path, out: Path | None, data: Path | None, engine: EngineO
             table=_table(main),
             plots=more,
             others=[
-                {
-                    "heading": _heading(each),
-                    "sentence": _sentence(each, files),
-                    "table": _table(each),
-                }
-                for each in others
+                {"heading": _heading(one), "sentence": _sentence(one, files), "table": _table(one)}
+                for one in every
+                if one is not main
             ],
             settings=Table(["", ""], _settings(main), words=2),
         )
@@ -158,16 +151,14 @@ def _sentence(record: Record, among: Sequence[Path]) -> str:
         drawn, frame = columns[0]["fragments_per_pixel"], columns[0]["frame_ms"]
         return f"{drawn:.1f} fragments per pixel drawn, frames of {frame:.2f} ms."
     seen = data["training_views"]
-    before, after = seen["fragments_per_pixel_before"], seen["fragments_per_pixel_after"]
-    if not before or not after:
+    if not (seen["fragments_per_pixel_before"] and seen["fragments_per_pixel_after"]):
         return f"{of}nothing was learned."
     return of + wording.outcome_in_training(data)
 
 
-def _goal(record: Record) -> str | None:
+def _goal(record: Record) -> Any:
     """The goal of a fine-tuning, as text; None of another command."""
-    goal: str | None = record.data.get("settings", {}).get("goal")
-    return goal
+    return record.data.get("settings", {}).get("goal")
 
 
 def _heading(record: Record) -> str:
@@ -219,18 +210,12 @@ def _settings(record: Record) -> list[list[str]]:
 
 @dataclass(frozen=True)
 class _Source:
-    """What the views of a record are drawn from.
+    """What the views of a record are drawn from."""
 
-    Attributes:
-        models: the original and the pruned model; joint learning leaves the latter alone.
-        needs: files and folders besides the models.
-        dataset: opens the views, with the original and an engine.
-    """
-
-    models: Sequence[Path]
+    models: Sequence[Path]  # original and pruned; joint learning leaves the latter alone
     filtered: bool
     drawing: Mapping[str, Any]
-    needs: Sequence[Path]
+    needs: Sequence[Path]  # files and folders besides the models
     dataset: Callable[[Model, Engine], Dataset]
 
 
@@ -239,9 +224,8 @@ def _source(record: Record, data: Path | None) -> _Source | None:
     own = own_cameras(record)
     if own is not None:
         with RECORD_FILE.stated(record.path):
-            models = [
-                records.located(record.data[name], record.path.parent) for name in ("model", "out")
-            ]
+            both = (record.data["model"], record.data["out"])
+            models = [records.located(name, record.path.parent) for name in both]
         needs = list(filter(None, [own.scene.data, own.cameras]))
         pictures = own.pictures if needs else partial(_from_above, own)
         return _Source(models, False, {}, needs, pictures)
@@ -249,9 +233,8 @@ def _source(record: Record, data: Path | None) -> _Source | None:
     if read is None:
         return None
     scene = read.photographs if data is None else replace(read.photographs, folder=data)
-    return _Source(
-        read.models, read.filtered, read.drawing, [scene.folder], lambda *_: load_photographs(scene)
-    )
+    how = read.filtered, read.drawing, [scene.folder]
+    return _Source(read.models, *how, lambda *_: load_photographs(scene))
 
 
 def _from_above(own: OwnCameras, model: Model, engine: Engine) -> Dataset:
@@ -270,13 +253,11 @@ def _draw(
     """Draw held-out views and learning curves into a folder.
 
     Args:
-        inside: the folder whose files may be read without ``data``.
-        data: the scene folder that the user named.
+        inside: the folder whose files may be read without ``data``, which the user named.
         opened: opens the engine; called only if there is something to draw.
 
     Returns:
-        The views, if any were drawn, (heading, file) of further pictures, and a sentence that
-        tells why views are missing ("" if none are).
+        The views, (heading, file) of further pictures, and why views are missing, or "".
     """
     source, curves = _source(record, data), record.data.get("curves")
     if source is None:
