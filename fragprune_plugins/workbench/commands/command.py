@@ -35,17 +35,11 @@ JSON = "fragprune.json"
 
 @dataclass(frozen=True)
 class Report:
-    """The output of a command.
+    """The output of a command."""
 
-    Attributes:
-        data: the object that --json prints.
-        text: the text for a person.
-        exit_code: 0; 1 if the check failed; 130 or 143 if learning was interrupted and saved.
-    """
-
-    data: dict[str, Any]
-    text: str
-    exit_code: int = 0
+    data: dict[str, Any]  # the object that --json prints
+    text: str  # for a person
+    exit_code: int = 0  # 1 if the check failed; 130 or 143 if learning was interrupted and saved
 
 
 class Command(click.Command):
@@ -54,38 +48,25 @@ class Command(click.Command):
     Of several processes one prints; None says that another one reports.
 
     A ``FragpruneError`` gives exit code 1, a usage error 2, Ctrl-C 130, SIGTERM during learning
-    143. Any other exception keeps its traceback.
-
-    Args:
-        rules: which of its options exclude or need each other; checked before anything is done.
-        args: of click's class, as ``kwargs``.
-        kwargs: likewise.
+    143. Any other exception keeps its traceback. ``rules`` say which of its options exclude or need
+    each other; they are checked before anything is done.
     """
 
     def __init__(self, *args: Any, rules: Rules = (), **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.rules = rules
-        self.params.append(
-            click.Option(
-                ["--json", "as_json"], is_flag=True, help="Print one JSON object on stdout."
-            )
-        )
+        said = "Print one JSON object on stdout."
+        self.params.append(click.Option(["--json", "as_json"], is_flag=True, help=said))
 
     def get_short_help_str(self, limit: int = 45) -> str:
         """The whole first sentence of --help: lists of commands wrap it instead of cutting it."""
         return super().get_short_help_str(max(limit, 200))
 
-    def make_context(
-        self,
-        info_name: str | None,
-        args: list[str],
-        parent: click.Context | None = None,
-        **extra: Any,
-    ) -> click.Context:
+    def make_context(self, info_name: str | None, args: list[str], *more: Any, **extra: Any) -> Any:
         """Parse the words; with --json among them, a usage error is printed as JSON."""
         words = list(args)
         try:
-            return super().make_context(info_name, args, parent, **extra)
+            return super().make_context(info_name, args, *more, **extra)
         except click.UsageError as error:
             raise usage_error(error, words) from error
         except FragpruneError as error:  # of a type of an argument
@@ -116,9 +97,8 @@ def work_of(package: str, **options: Any) -> Report:
 
     It is imported on use, so that ``fragprune --help`` needs no torch.
     """
-    work: Callable[..., Report] = getattr(
-        import_module(f"{package}.work"), package.rpartition(".")[2]
-    )
+    name = package.rpartition(".")[2]
+    work: Callable[..., Report] = getattr(import_module(f"{package}.work"), name)
     expect_numpy()
     return work(**options)
 
@@ -197,12 +177,7 @@ def _machine_stated(where: str) -> Iterator[None]:
 
 
 def usage_error(error: click.UsageError, words: list[str]) -> Exception:
-    """The exception to raise for a usage error. With --json, prints the error and returns an exit.
-
-    Args:
-        error: click's error.
-        words: words of the command line. Words after ``--`` belong to the host's command.
-    """
+    """What to raise for a usage error: with --json an exit, once the error is printed."""
     if not should_print():
         return click.exceptions.Exit(2)
     if "--json" not in _ours(words):

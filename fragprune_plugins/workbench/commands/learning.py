@@ -143,15 +143,9 @@ _OF_FINETUNE = (
 def learning_options(*, every_goal: bool) -> Callable[[Function], Function]:
     """The options of learning, which a command gets as ``settings``.
 
-    Its own ``seed``, ``itself`` and ``views_per_step``, if it has them, are part of these.
-
-    Args:
-        every_goal: offer also goals that a host's training cannot meet.
-
-    Raises:
-        UsageError: a value is out of range.
+    Its own ``seed``, ``itself`` and ``views_per_step``, if it has them, are part of these. With
+    ``every_goal`` goals are offered, too, that a host's training cannot meet.
     """
-
     options = _OPTIONS + _OF_FINETUNE if every_goal else _OPTIONS
     return bundled(lambda given: {"settings": _settings(given)}, *options)
 

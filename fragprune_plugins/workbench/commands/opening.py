@@ -33,10 +33,7 @@ def bound_threads(threads: int | None) -> None:
 
 
 def open_engine(options: EngineOptions) -> tuple[Engine, torch.device]:
-    """Open the engine of the options; its threads are bounded.
-
-    Returns:
-        The engine, and the device for models and views.
+    """The engine of the options, its threads bounded, and the device for models and views.
 
     Raises:
         UsageError: the device does not exist.
@@ -67,9 +64,8 @@ def photographs_for(
     if trained is None:
         found = f"no folder, and no {ARGUMENTS} of a training around {model}"
         raise UsageError("--data", found, "photographs", remedy)
-    click.echo(
-        printable(f"Photographs: {trained.folder}, which the model was trained on"), err=True
-    )
+    said = f"Photographs: {trained.folder}, which the model was trained on"
+    click.echo(printable(said), err=True)
     return overridden(trained, scene)
 
 
@@ -114,15 +110,11 @@ def chosen(dataset: Dataset, views: str) -> Sequence[Shot]:
 
 @dataclass(frozen=True)
 class OwnCameras:
-    """The cameras of a model's own pictures: those that options name; all around it without any.
-
-    Attributes:
-        seed: of what is generated.
-    """
+    """The cameras of a model's own pictures: those that options name; all around it without any."""
 
     scene: SceneOptions
     cameras: Path | None
-    seed: int = 0
+    seed: int = 0  # of what is generated
 
     def pictures(self, model: Model, engine: Engine) -> Dataset:
         """A model's own pictures from these cameras.

@@ -25,11 +25,7 @@ FILE = click.Path(path_type=Path)
 
 
 class OutFile(click.Path):
-    """Type of an option for a file to write; refuses a name without a suffix before any work.
-
-    Args:
-        suffixes: one is required, such as ".ply"; upper and lower case are equal.
-    """
+    """Type of an option for a file to write; refuses a name without one of some suffixes."""
 
     def __init__(self, *suffixes: str) -> None:
         super().__init__(path_type=Path)
@@ -95,9 +91,7 @@ def bundled(
 ) -> Callable[[Function], Function]:
     """Several options as one decorator; --help shows them in this order.
 
-    Args:
-        gather: takes out of the command's arguments those of the options, and returns what the
-            command gets in their place.
+    ``gather`` takes them out of the command's arguments, and returns what it gets in their place.
     """
 
     def decorate(function: Function) -> Function:
@@ -175,21 +169,13 @@ TRAINED_ON = "Default: the photographs that MODEL was trained on, by the cfg_arg
 
 @dataclass(frozen=True)
 class SceneOptions:
-    """Photographs and their size: ``--data``, ``--images``, ``--resolution`` and so on.
-
-    Attributes:
-        data: the scene folder; None where no option names it.
-        images: folder of ``data`` with the images.
-        resolution: divisor of the images' sides.
-        white_background: transparent images are composited over white.
-        given: names of the options that the user gave, such as "resolution".
-    """
+    """Photographs and their size: ``--data``, ``--images``, ``--resolution`` and so on."""
 
     data: Path | None = None
-    images: str = "images"
-    resolution: int = 1
+    images: str = "images"  # folder of ``data``
+    resolution: int = 1  # divisor of the images' sides
     white_background: bool = False
-    given: frozenset[str] = frozenset()
+    given: frozenset[str] = frozenset()  # names of the options that the user gave
 
     def as_record(self, cameras: Path | None) -> dict[str, Any]:
         """The cameras of a model's own pictures as plain values, for records."""

@@ -19,14 +19,10 @@ from fragprune_plugins.errors import UsageError
 
 @dataclass(frozen=True)
 class Alone:
-    """At most one of some options is given.
-
-    Attributes:
-        expected: what an error says was expected.
-    """
+    """At most one of some options is given."""
 
     names: tuple[str, ...]
-    expected: str = "one of the two"
+    expected: str = "one of the two"  # in an error's words
 
     def check(self, context: click.Context) -> None:
         """Raise UsageError if two are given."""
@@ -38,16 +34,11 @@ class Alone:
 
 @dataclass(frozen=True)
 class Needs:
-    """An option is given only with another one.
-
-    Attributes:
-        others: one of these must be given.
-        expected: what an error says was expected.
-    """
+    """An option is given only with one of others."""
 
     name: str
     others: tuple[str, ...]
-    expected: str
+    expected: str  # in an error's words
 
     def check(self, context: click.Context) -> None:
         """Raise UsageError if it is given without any of the others."""

@@ -37,19 +37,13 @@ SILENT = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A model to measure, and how to draw it.
-
-    Attributes:
-        model: the Gaussians. Plugins are asked for its thresholds at every view.
-        drawing: fields of ``RasterInputs`` that differ from vanilla's rules.
-        gaussians: of the whole splat, where the model is this process' part of it.
-        cut: (N,) thresholds to draw with as they are, in place of the model's.
-    """
+    """A model to measure, and how to draw it; plugins are asked for thresholds at every view."""
 
     model: Model
     drawing: Mapping[str, Any] = field(default_factory=dict)
-    gaussians: int | None = None
-    cut: Tensor | None = None
+    """Fields of ``RasterInputs`` that differ from vanilla's rules."""
+    gaussians: int | None = None  # of the whole splat, where the model is this process' part of it
+    cut: Tensor | None = None  # (N,) thresholds to draw with as they are, in place of the model's
 
     __repr__ = one_line
 

@@ -17,16 +17,11 @@ from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats
 
 @dataclass(frozen=True)
 class Extent:
-    """A rule for the radius of an ellipse, in standard deviations.
-
-    Attributes:
-        sigmas: the largest radius.
-        alpha: an ellipse ends where its alpha falls below this; 0 for however faint.
-    """
+    """A rule for the radius of an ellipse, in standard deviations."""
 
     name: str
-    sigmas: float = math.inf
-    alpha: float = 0.0
+    sigmas: float = math.inf  # the largest radius
+    alpha: float = 0.0  # an ellipse ends where its alpha falls below this; 0 for however faint
 
     def squared(self, opacities: Tensor) -> Tensor:
         """(N,) squared radii of Gaussians of these opacities; negative where nothing is drawn."""
@@ -52,31 +47,24 @@ CUTS = (
 
 @dataclass(frozen=True)
 class Viewer:
-    """How some viewers draw a Gaussian.
-
-    Attributes:
-        extent: the ellipse that they fill.
-        shape: what they rasterize for it: a "quad" around its axes, the tiles of a "square" of the
-            longer axis, or those of its bounding "box".
-    """
+    """How some viewers draw a Gaussian."""
 
     names: str
-    extent: Extent
+    extent: Extent  # the ellipse that they fill
     shape: Literal["quad", "square", "box"] = "quad"
+    """What they rasterize for it: a quad around its axes, the tiles of a square of the longer axis,
+    or those of its bounding box."""
 
 
 SQRT8 = Extent("quads of √8 sigma", sigmas=math.sqrt(8))
+_SIGMAS_OF_255 = math.sqrt(2 * math.log(255))  # at which an opaque Gaussian's alpha is 1/255
 
 VIEWERS = (
     Viewer("antimatter15/splat, GaussianSplats3D, Spark, Babylon.js", SQRT8),
     Viewer("PlayCanvas", Extent("quads of √8 sigma, 1/255", math.sqrt(8), ALPHA_MIN)),
     Viewer("three.js GaussianSplatMesh", Extent("quads of 2 sigma", sigmas=2.0)),
     Viewer("3DGS reference (CUDA)", Extent("tiles of a 3 sigma square", sigmas=3.0), "square"),
-    Viewer(
-        "gsplat 1.5",
-        Extent("tiles of a box, 1/255", math.sqrt(2 * math.log(255)), ALPHA_MIN),
-        "box",
-    ),
+    Viewer("gsplat 1.5", Extent("tiles of a box, 1/255", _SIGMAS_OF_255, ALPHA_MIN), "box"),
 )
 """The rules of viewers, read from their sources in 2026.
 
@@ -91,9 +79,9 @@ set. Babylon.js ``gaussianSplatting.fx``: as antimatter15. PlayCanvas 2.22 ``gsp
 def covered(engine: Engine, inputs: RasterInputs, squared: Tensor) -> RasterOutputs:
     """Draw so that fragments count all pixels in the Gaussians' ellipses, hidden ones too.
 
+    Engines look no farther than 3.33 standard deviations.
+
     Args:
-        engine: counts them; it looks no farther than 3.33 standard deviations.
-        inputs: of one rasterization of ``Splats``.
         squared: (N,) squared radii of the ellipses; negative for none.
     """
     # Alpha capped at its least hides nothing; see ``visible``. A threshold then ends each ellipse.

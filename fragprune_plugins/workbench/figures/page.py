@@ -27,27 +27,16 @@ Size = tuple[int, int]
 
 @dataclass(frozen=True)
 class Table:
-    """A table whose first columns are words and whose others are numbers.
-
-    Attributes:
-        rows: cells as they are to be read, as many as the head has.
-        caption: below the table.
-        words: how many columns are words.
-    """
+    """A table whose first columns are words and whose others are numbers."""
 
     head: Sequence[str]
-    rows: Sequence[Sequence[str]]
+    rows: Sequence[Sequence[str]]  # cells as they are to be read
     caption: str = ""
-    words: int = 1
+    words: int = 1  # how many columns are words
 
 
 def render(template: Path, *others: Path, **values: Any) -> str:
-    """A page.
-
-    Args:
-        others: folders of further templates that it extends or includes.
-        values: what the template shows; "title" is also the page's heading.
-    """
+    """A page of a template, which may use those in other folders; "title" is also its heading."""
     environment = Environment(
         loader=FileSystemLoader([template.parent, *others, TEMPLATES]),
         autoescape=True,
@@ -57,10 +46,9 @@ def render(template: Path, *others: Path, **values: Any) -> str:
     )
     environment.globals["colours"] = colour_stops
     style, script = (
-        (TEMPLATES / name).read_text(encoding="utf-8") for name in ("page.css", "page.js")
+        Markup((TEMPLATES / name).read_text(encoding="utf-8")) for name in ("page.css", "page.js")
     )
-    policy = Markup(allowed(script))
-    frame = {"style": Markup(style), "script": Markup(script), "allowed": policy}
+    frame = {"style": style, "script": script, "allowed": Markup(allowed(script))}
     return environment.get_template(template.name).render(frame | values)
 
 

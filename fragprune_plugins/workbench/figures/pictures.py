@@ -63,8 +63,7 @@ def save_image(path: Path, image: Tensor) -> None:
     Raises:
         OutputError: the file cannot be written. Every function here raises it.
     """
-    with replacing(path) as temporary:
-        picture(image).save(temporary, format="PNG")
+    _save(path, picture(image))
 
 
 def picture(image: Tensor) -> PIL.Image.Image:
@@ -74,14 +73,16 @@ def picture(image: Tensor) -> PIL.Image.Image:
 
 
 def save_map(path: Path, values: Tensor, limit: float) -> None:
-    """Write values (H, W) as colours, one pixel for each, without a scale: ``colour_stops`` has it.
+    """Write values (H, W), 0 or more, as colours, without a scale: ``colour_stops`` has it.
 
-    Args:
-        values: 0 or more.
-        limit: the value at the top of the scale; what is larger looks like it.
+    Values above the limit look like it.
     """
+    _save(path, _map(values, limit))
+
+
+def _save(path: Path, shown: PIL.Image.Image) -> None:
     with replacing(path) as temporary:
-        _map(values, limit).save(temporary, format="PNG")
+        shown.save(temporary, format="PNG")
 
 
 def _map(values: Tensor, limit: float) -> PIL.Image.Image:
@@ -97,11 +98,9 @@ def colour_stops(count: int = 9) -> list[str]:
 
 
 def save_panel(path: Path, pictures: Sequence[tuple[str, Tensor]], limit: float) -> None:
-    """Write pictures side by side under their titles; counts (H, W) become colours.
+    """Write pictures of one size side by side under their titles: (3, H, W), or counts (H, W).
 
-    Args:
-        pictures: (title, picture), where a picture is (3, H, W) RGB or (H, W) counts, of one size.
-        limit: the count at the top of the colour scale, which all (H, W) share.
+    Counts become colours of one scale, which ends at ``limit``.
     """
     height, width = pictures[0][1].shape[-2:]
     times = -(-_TALL // height)  # small pictures grow by whole pixels
@@ -120,8 +119,7 @@ def save_panel(path: Path, pictures: Sequence[tuple[str, Tensor]], limit: float)
         pen.text((at, _TEXT // 4), title, "black", font)
         large = each.resize((times * each.width, times * height), PIL.Image.Resampling.NEAREST)
         panel.paste(large, (at, 2 * _TEXT))
-    with replacing(path) as temporary:
-        panel.save(temporary, format="PNG")
+    _save(path, panel)
 
 
 PANELS = 4
@@ -137,11 +135,8 @@ def leave_panels(
 ) -> str:
     """Draw ``PANELS`` evenly spread views at most, and leave a command's record beside them.
 
-    A panel has the photograph, the renders, and the fragments on one scale. The record is the
-    report with ``files``, the names of the panels, which is added.
-
-    Returns:
-        A line that says so.
+    A panel has the photograph, the renders, and the fragments on one scale. Its name is added to
+    the report, which is the record. Returns a line that says so.
     """
     files = []
     chosen = evenly_spaced(shots, PANELS)

@@ -35,16 +35,11 @@ _NUMBERS = {"scale_modifier", "dilation", "near", "alpha_max"}
 
 @dataclass(frozen=True)
 class Record:
-    """The figures of one command.
-
-    Attributes:
-        command: the command that wrote it: run, finetune, compare or profile.
-        data: the command's --json output, and further data for the page.
-    """
+    """The figures of one command."""
 
     path: Path
-    command: str
-    data: dict[str, Any]
+    command: str  # that wrote it: run, finetune, compare or profile
+    data: dict[str, Any]  # its --json output, and further data for the page
 
 
 def leave(model: Path, command: str, data: dict[str, Any]) -> Path:
@@ -154,18 +149,14 @@ def _spellings(path: str | Path) -> list[str]:
 
 @dataclass(frozen=True)
 class Recorded:
-    """The "photographs" of a record.
-
-    Attributes:
-        models: the model before and the model after; joint learning leaves the latter alone.
-        filtered: whether the models may be such as only their host's rules draw; see ``read_ply``.
-        drawing: fields of ``RasterInputs`` that differ from vanilla's rules.
-    """
+    """The "photographs" of a record."""
 
     photographs: Photographs
     models: tuple[Path, ...]
-    filtered: bool = False
+    """The model before and the model after; joint learning leaves the latter alone."""
+    filtered: bool = False  # whether only their host's rules may draw them; see ``read_ply``
     drawing: Mapping[str, Any] = field(default_factory=dict)
+    """Fields of ``RasterInputs`` that differ from vanilla's rules."""
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, for ``recorded``."""
@@ -201,13 +192,15 @@ def recorded(record: Record) -> Recorded | None:
             number = isinstance(value, int | float) and 0 <= value < 1e6
             if not (number if name in _NUMBERS else name == "compensation"):
                 raise ValueError(f"{name} is {value!r}")
-        filtered = bool(values["filtered"])
-        scene, size = located(values["folder"], folder), Resolution(**values["resolution"])
-        white, images = values["white_background"], values["images"]
-        centred = None if values.get("centred") is None else bool(values["centred"])
-        how = centred, bool(values.get("opaque"))
-        photographs = Photographs(scene, size, white, images, *how)
-        return Recorded(photographs, models, filtered, drawing)
+        photographs = Photographs(
+            located(values["folder"], folder),
+            Resolution(**values["resolution"]),
+            values["white_background"],
+            values["images"],
+            centred=None if values.get("centred") is None else bool(values["centred"]),
+            opaque=bool(values.get("opaque")),
+        )
+        return Recorded(photographs, models, bool(values["filtered"]), drawing)
 
 
 def control_of(data: dict[str, Any], among: Sequence[Path]) -> dict[str, Any] | None:
@@ -216,12 +209,7 @@ def control_of(data: dict[str, Any], among: Sequence[Path]) -> dict[str, Any] | 
     The control started from the same model, by the same host's loop and options or ours, on the
     same photographs as far as is known, with the same iterations, views in each step, seed and
     settings, and kept as many Gaussians or all, but without truncation and without a stop or a
-    dropout of its own.
-    Files that are not records are ignored.
-
-    Args:
-        data: of the fine-tuning, including "before", "iterations" and "settings".
-        among: the files to search; the last match counts.
+    dropout of its own. Of several the last counts. Files that are not records are ignored.
     """
     for path in reversed(among):
         with contextlib.suppress(RecordError), RECORD_FILE.stated(path):

@@ -118,19 +118,17 @@ def sizes(pictures: Sequence[tuple[int, ...]]) -> str:
 def nothing_drawn(fragments: Sequence[float]) -> list[str]:
     """A warning where no Gaussian is seen; [] where each view or measurement has some."""
     empty = sum(each == 0 for each in fragments)
-    if not empty:
-        return []
-    return [
+    said = (
         f"{empty} of {len(fragments)} show no Gaussian (0.0 fragments per pixel). Are these the "
         "cameras of this model?"
-    ]
+    )
+    return [said] if empty else []
 
 
 def gain(before: dict[str, Any], after: dict[str, Any], enlarge: int = 1) -> str:
     """A phrase for the gain of one measurement over another: fragments, frame times, PSNR.
 
-    Args:
-        enlarge: timed frames are this many times as wide and high as the pictures.
+    Timed frames are ``enlarge`` times as wide and high as the pictures.
     """
     return (
         f"{fewer(before['fragments_per_pixel'], after['fragments_per_pixel'])}, "
@@ -159,9 +157,8 @@ def outcome(command: str, data: dict[str, Any], control: dict[str, Any] | None) 
     """A sentence for the gain of a fine-tuning on held-out views, and for the control's share.
 
     Args:
-        command: "run" or "finetune".
-        data: its figures, including "before", "after" and "settings"; and "seen", which records may
-            lack: whether the training before it held nothing out.
+        data: its figures; with "seen", which records may lack: whether the training before it held
+            nothing out.
         control: what as many iterations without truncation gave; None if not run.
     """
     before, after = data["before"], data["after"]
@@ -196,14 +193,9 @@ def outcome_in_training(data: Mapping[str, Any]) -> str:
 
 
 def headlines(data: Mapping[str, Any], control: dict[str, Any] | None) -> list[tuple[str, str]]:
-    """Three figures of a fine-tuning in plain words: fragments, frame time, picture.
+    """Fragments, frame time, picture of a fine-tuning: (the figure, what it says) of each.
 
-    Args:
-        data: its figures, including "before" and "after"; frames of "larger" pictures, if there.
-        control: the measurement after as many iterations without truncation; None if not run.
-
-    Returns:
-        (the figure, what it says) of each.
+    Frames are those of "larger" pictures, if its figures have them.
     """
     before, after = data["before"], data["after"]
     larger = data.get("larger", data)
@@ -222,10 +214,8 @@ def headlines(data: Mapping[str, Any], control: dict[str, Any] | None) -> list[t
         gained = _by_pruning(before, after, control)
         picture = f"{gained:+.2f} dB", "PSNR against the same training without pruning"
     else:
-        picture = (
-            f"{after['psnr'] - before['psnr']:+.2f} dB",
-            "PSNR against the original; more training may be a part of it",
-        )
+        said = "PSNR against the original; more training may be a part of it"
+        picture = f"{after['psnr'] - before['psnr']:+.2f} dB", said
     return [_drawn(was, now), frame, picture]
 
 
@@ -264,12 +254,7 @@ def quoted(path: object) -> str:
 
 
 def begun(data: Mapping[str, Any]) -> list[str]:
-    """Lines on what came before the first step of a fine-tuning: its trial, and Gaussians removed.
-
-    Args:
-        data: its figures, with "settings", "before" and "after"; and "keep" and "forgotten", which
-            records may lack.
-    """
+    """Lines on what came before a fine-tuning's first step: its trial, and Gaussians removed."""
     lines, dropout, keep = [], data["settings"].get("dropout"), data.get("keep")
     if data.get("forgotten") is not None and dropout:
         lines.append(
