@@ -9,16 +9,8 @@ from typing import Any
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.types import View
+from fragprune_plugins.workbench.commands import opening
 from fragprune_plugins.workbench.commands.command import Report
-from fragprune_plugins.workbench.commands.opening import (
-    OwnCameras,
-    chosen,
-    drawn_as_trained,
-    open_engine,
-    overridden,
-    own_cameras,
-    own_cameras_for,
-)
 from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
 from fragprune_plugins.workbench.figures import records, wording
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
@@ -43,11 +35,11 @@ def compare(
     engine: EngineOptions,
 ) -> Report:
     """Do what ``fragprune compare`` promises; its options are the arguments."""
-    rasterizer, device = open_engine(engine)
+    rasterizer, device = opening.open_engine(engine)
     if out is not None:
         writable_folder(out)
     known = _records(a, b)
-    own = own_cameras_for(a, scene, cameras, orbit=orbit) if itself else None
+    own = opening.own_cameras_for(a, scene, cameras, orbit=orbit) if itself else None
     if own is None and scene.data is None:
         own = _recorded_cameras(scene, a, b)
     photographs = None if own else _photographs(scene, known, a, b)
@@ -63,7 +55,7 @@ def compare(
         assert photographs is not None
         photographs, dataset = told_or_matched(candidates[0].model, photographs, rasterizer)
         shown = f"{photographs.folder}"
-    shots = chosen(dataset, views)
+    shots = opening.chosen(dataset, views)
     before, after = measure_all(candidates, shots, engine=rasterizer, enlarge=enlarge)
     measured = [(str(a), before), (str(b), after)]
     report = _figures(measured, enlarge, photographs)
@@ -129,10 +121,10 @@ def _records(*models: Path) -> dict[Path, records.Recorded]:
     return known
 
 
-def _recorded_cameras(scene: SceneOptions, *models: Path) -> OwnCameras | None:
+def _recorded_cameras(scene: SceneOptions, *models: Path) -> opening.OwnCameras | None:
     """The cameras of the fine-tuning with --self that wrote one of the models; None without one."""
     written = filter(None, map(records.beside, models))
-    return next(filter(None, (own_cameras(record, scene) for record in written)), None)
+    return next(filter(None, (opening.own_cameras(record, scene) for record in written)), None)
 
 
 def _photographs(
@@ -143,7 +135,7 @@ def _photographs(
     if not read and scene.data is None:
         read = {each for each in map(trained_on, models) if each is not None}
     if len(read) == 1:
-        return overridden(read.pop(), scene)
+        return opening.overridden(read.pop(), scene)
     if scene.data is None:
         raise UsageError(
             "--data",
@@ -153,4 +145,4 @@ def _photographs(
             "a scene folder, or A's own pictures",
             "Name it with --data; without photographs, pass --self.",
         )
-    return drawn_as_trained(scene, *models)
+    return opening.drawn_as_trained(scene, *models)

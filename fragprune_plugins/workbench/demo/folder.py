@@ -39,7 +39,7 @@ def clear(out: Path) -> None:
     for path in found.values():
         path.unlink()
     for folder in sorted({up for path in found.values() for up in path.parents}, reverse=True):
-        if folder.is_relative_to(out) and folder != out:
+        if out in folder.parents:
             with contextlib.suppress(OSError):  # the folder holds a hidden file
                 folder.rmdir()
     _list(out, {})

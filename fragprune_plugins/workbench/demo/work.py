@@ -25,14 +25,13 @@ from fragprune_plugins.workbench.commands.opening import open_engine
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.demo.folder import claiming, clear
 from fragprune_plugins.workbench.demo.scene import POINTS, VIEWS, WIDTH, make_scene
-from fragprune_plugins.workbench.figures import records
+from fragprune_plugins.workbench.figures import records, wording
 from fragprune_plugins.workbench.figures.evaluate import (
     Candidate,
     enlarged,
     frame_times,
     measure_all,
 )
-from fragprune_plugins.workbench.figures.wording import begun, describe, frames, headlines, outcome
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.report import page as report_page
 from fragprune_plugins.workbench.run.work import Looking, figures_of
@@ -59,15 +58,10 @@ _REPEATS = 5  # timed frames for each view
 
 @dataclass(frozen=True)
 class DemoSettings:
-    """Settings of a demo.
-
-    Attributes:
-        iterations, finetune: of the host's own training, and of stage 2.
-        views, width, points: of the scene, as ``make_scene`` takes them.
-    """
+    """Settings of a demo: its training, and its scene as ``make_scene`` takes it."""
 
     iterations: int = 1000
-    finetune: int = 500
+    finetune: int = 500  # iterations of stage 2
     seed: int = 0
     engine: str = "auto"
     device: str = "cpu"
@@ -84,11 +78,12 @@ def demo(*, out: Path, iters: int, seed: int, engine: EngineOptions) -> Report:
     )
     report = run_demo(out, settings, partial(click.echo, err=True))
     larger = report["larger"]
-    table = describe({"original": report["before"], "pruned": report["after"]})
-    told = [outcome("run", report, report["control"]), *begun(report)]
+    table = wording.describe(wording.columns_of(report))
+    told = [wording.outcome("run", report, report["control"]), *wording.begun(report)]
+    frames = wording.frames(larger["before"], larger["after"])
     text = (
         f"\n{table}\n\n" + "\n".join(told) + "\n"
-        f"Of larger pictures, {larger['size']}: {frames(larger['before'], larger['after'])}.\n"
+        f"Of larger pictures, {larger['size']}: {frames}.\n"
         f"Took {report['seconds']:.0f} s. Open {out / 'index.html'} for the pictures. "
         f"To turn it: fragprune view {out}"
     )
@@ -123,15 +118,10 @@ def host_command(scene: Path, model: Path, settings: DemoSettings) -> list[str]:
 def run_demo(
     out: Path, settings: DemoSettings, say: Callable[[str], None] = lambda line: None
 ) -> dict[str, Any]:
-    """Train the host on the room, fine-tune, measure and draw. Progress goes to stderr.
-
-    Args:
-        out: folder for ``scene/``, ``model/``, ``pictures/``, ``index.html`` and ``report.json``.
-        say: called with one line of text at the start of each part.
+    """Train the host on the room, fine-tune, measure and draw; says a line at each part's start.
 
     Returns:
-        The report. "before", "after" and "control" are measurements on held-out views; the control
-        learned for as many iterations without cutoffs. "seconds" is wall time.
+        The report, with the measurements on held-out views "before", "after" and "control".
 
     Raises:
         OutputError: the folder cannot be written, or holds files that no demo wrote.
@@ -189,17 +179,12 @@ def write_page(
     engine: str,
     device: str,
 ) -> list[str]:
-    """Write ``pictures/`` and ``index.html``.
+    """Write ``pictures/`` and ``index.html``; returns their files, relative to ``out``.
 
-    Args:
-        report: the measurements; "larger" is added, frame times of pictures as large as the page's.
-
-    Returns:
-        The files as paths relative to ``out``.
+    Adds "larger" to the report: frame times of pictures as large as the page's.
     """
     pictures = out / "pictures"
-    paths = (Path(report["model_before"]), Path(report["model_after"]))
-    one, other = (models.load(path, device=device) for path in paths)
+    one, other = (models.load(report[f"model_{k}"], device=device) for k in ("before", "after"))
     original, pruned = Candidate(one.untruncated()), Candidate(other)
     shots = sorted(load_dataset(scene).test, key=lambda shot: shot.name != _FIRST)
     rasterizer = engine_for(engine, device)
@@ -220,10 +205,10 @@ def write_page(
         drawn,
         lambda file: f"pictures/{file}",
         title="The same picture from fewer fragments",
-        facts=headlines(report, report["control"]),
-        quote=outcome("run", report, report["control"]),
+        facts=wording.headlines(report, report["control"]),
+        quote=wording.outcome("run", report, report["control"]),
         seen=False,
-        notes=begun(report),
+        notes=wording.begun(report),
         table=report_page.figures(
             {"original": report["before"], "control": report["control"], "pruned": report["after"]}
         ),

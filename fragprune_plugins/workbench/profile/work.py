@@ -7,13 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from fragprune_plugins.workbench.commands import opening
 from fragprune_plugins.workbench.commands.command import Report
-from fragprune_plugins.workbench.commands.opening import (
-    chosen,
-    open_engine,
-    own_cameras_for,
-    photographs_for,
-)
 from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
 from fragprune_plugins.workbench.figures.matching import told_or_matched
@@ -35,18 +30,18 @@ def profile(
     engine: EngineOptions,
 ) -> Report:
     """Do what ``fragprune profile`` promises; its options are the arguments."""
-    rasterizer, device = open_engine(engine)
+    rasterizer, device = opening.open_engine(engine)
     if out is not None:
         writable_folder(out)
     loaded = load(model, truncation=not no_truncation, device=device)
     if itself:
-        own = own_cameras_for(model, scene, cameras, orbit=orbit)
+        own = opening.own_cameras_for(model, scene, cameras, orbit=orbit)
         dataset = own.pictures(loaded.untruncated(), rasterizer)
     else:
         remedy = "Name the scene's folder with --data; without photographs, pass --self."
-        read = photographs_for(model, scene, remedy=remedy)
+        read = opening.photographs_for(model, scene, remedy=remedy)
         _, dataset = told_or_matched(loaded.untruncated(), read, rasterizer)
-    shots = chosen(dataset, views)
+    shots = opening.chosen(dataset, views)
     columns = {"untruncated": Candidate(loaded.untruncated())}
     if loaded.falloff is not None:
         columns["truncated"] = Candidate(loaded)

@@ -114,10 +114,7 @@ _LEVEL = 7  # of zlib: 9 takes up to seven times as long for 1.6 % fewer bytes
 
 
 def compact(tables: bytes, facts: dict[str, Any]) -> tuple[bytes, dict[str, int], list[str]]:
-    """Tables in few bytes.
-
-    Args:
-        tables, facts: from ``pack``.
+    """What ``pack`` gave, in few bytes.
 
     Returns:
         The bytes; ``bits`` and ``rows`` for the facts; what was rounded, as words for the user.

@@ -49,26 +49,16 @@ _PHOTOGRAPH_SIDE = 960
 
 @dataclass(frozen=True)
 class Layer:
-    """One of at most two sides of the picture.
-
-    Attributes:
-        name: what the page calls it.
-        truncated: whether its thresholds apply.
-    """
+    """One of at most two sides of the picture."""
 
     name: str
     model: int
-    truncated: bool
+    truncated: bool  # whether its thresholds apply
 
 
 @dataclass(frozen=True)
 class Shown:
-    """A camera of the page's list.
-
-    Attributes:
-        name: what the page calls it.
-        photograph: of this camera; None where there is none.
-    """
+    """A camera of the page's list, and the photograph that it took, if there is one."""
 
     name: str
     view: View
@@ -180,15 +170,13 @@ def single_page(site: Site) -> bytes:
     )
     style = site["style.css"].decode()
     page = site["index.html"].decode()
+    script = f'{held}<script type="module">{code}</script>'
     for before, after in (
         ("script-src 'self'", f"script-src {allowed(code)}"),
         ("style-src 'self'", f"style-src {allowed(style)}"),
         ("connect-src 'self'; img-src 'self' data:", "img-src data:"),
         ('<link rel="stylesheet" href="style.css">', f"<style>{style}</style>"),
-        (
-            '<script type="module" src="main.js"></script>',
-            f'{held}<script type="module">{code}</script>',
-        ),
+        ('<script type="module" src="main.js"></script>', script),
     ):
         page = page.replace(before, after, 1)
     return page.encode()

@@ -21,17 +21,7 @@ from fragprune_plugins.workbench.models.model import load, writable_folder
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
 from fragprune_plugins.workbench.scenes.output import cameras_of, output_folder
-from fragprune_plugins.workbench.view.site import (
-    Layer,
-    Shown,
-    Site,
-    address,
-    compacted,
-    make_site,
-    open_server,
-    save_site,
-    single_page,
-)
+from fragprune_plugins.workbench.view import site as sites
 
 
 def view(
@@ -64,7 +54,7 @@ def view(
     else:
         start = overview(models[-1])
         start.background.copy_(torch.full((3,), float(white_background)))
-    site = make_site(model.name, models, _layers(paths, truncated), shown, start)
+    site = sites.make_site(model.name, models, _layers(paths, truncated), shown, start)
     facts: dict[str, Any] = {
         "model": str(model),
         "compare": None if other is None else str(other),
@@ -79,15 +69,15 @@ def view(
     if out is None:
         facts["address"] = _serve(site, port, browse=not no_browser)
         return Report(facts, "The viewer is closed.")
-    site, rounded = compacted(site)
+    site, rounded = sites.compacted(site)
     if single:
-        page = single_page(site)
+        page = sites.single_page(site)
         with replacing(out) as temporary:
             temporary.write_bytes(page)
         site, files, what = {out.name: page}, [str(out)], str(out)
         then = "Open it in a browser."
     else:
-        save_site(out, site)
+        sites.save_site(out, site)
         files, what = [str(out / name) for name in sorted(site)], f"{len(site)} files to {out}"
         then = f"A web server has to serve them; here: python -m http.server -d {out}"
     size = sum(map(len, site.values()))
@@ -110,13 +100,13 @@ def _original(model: Path) -> Path | None:
     return None if original.samefile(model) else original
 
 
-def _layers(paths: list[Path], truncated: list[bool]) -> list[Layer]:
+def _layers(paths: list[Path], truncated: list[bool]) -> list[sites.Layer]:
     """The sides of the split, from left to right."""
     if len(paths) == 1:
-        pruned = [Layer("No cutoffs", 0, False), Layer("Pruned", 0, True)]
-        return pruned if truncated[0] else [Layer(paths[0].stem, 0, False)]
+        pruned = [sites.Layer("No cutoffs", 0, False), sites.Layer("Pruned", 0, True)]
+        return pruned if truncated[0] else [sites.Layer(paths[0].stem, 0, False)]
     names = ("Original", "Pruned") if truncated == [False, True] else _told_apart(*paths)
-    return [Layer(name, index, truncated[index]) for index, name in enumerate(names)]
+    return [sites.Layer(name, index, truncated[index]) for index, name in enumerate(names)]
 
 
 def _told_apart(left: Path, right: Path) -> tuple[str, str]:
@@ -128,21 +118,21 @@ def _told_apart(left: Path, right: Path) -> tuple[str, str]:
     return str(left), str(right)
 
 
-def _cameras(scene: SceneOptions, cameras: Path | None, models: list[Path]) -> list[Shown]:
+def _cameras(scene: SceneOptions, cameras: Path | None, models: list[Path]) -> list[sites.Shown]:
     """The cameras of the page's list: held-out ones of a scene, or all of a file."""
     if scene.data is not None:
         shots = load_photographs(drawn_as_trained(scene, *models)).test
-        return [Shown(shot.name, shot.view, shot) for shot in shots]
+        return [sites.Shown(shot.name, shot.view, shot) for shot in shots]
     if cameras is not None:
         named = load_cameras(cameras, white_background=scene.white_background)
-        return [Shown(name, camera) for name, camera in named]
+        return [sites.Shown(name, camera) for name, camera in named]
     return []
 
 
-def _serve(site: Site, port: int, *, browse: bool) -> str:
+def _serve(site: sites.Site, port: int, *, browse: bool) -> str:
     """Serve until Ctrl-C; gives the address."""
-    with open_server(site, port) as server:
-        where = address(server)
+    with sites.open_server(site, port) as server:
+        where = sites.address(server)
         click.echo(f"The viewer is at {where} until Ctrl-C.", err=True)
         if browse:
             webbrowser.open(where)
