@@ -47,8 +47,7 @@ def without(text: str, names: Collection[str]) -> str:
     lines, gone = text.splitlines(keepends=True), set()
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.FunctionDef) and node.name in names:
-            first = min([node.lineno, *(each.lineno for each in node.decorator_list)])
-            gone |= set(range(first, (node.end_lineno or first) + 1))
+            gone |= set(range(_first_line(node), (node.end_lineno or 0) + 1))
     return "".join(line for number, line in enumerate(lines, 1) if number not in gone)
 
 
@@ -67,7 +66,10 @@ def _body(kind: type) -> str:
     source = textwrap.dedent(inspect.getsource(kind))
     (definition,) = ast.parse(source).body
     assert isinstance(definition, ast.ClassDef)
-    methods = [node for node in definition.body if isinstance(node, ast.FunctionDef)]
-    decorators = [node.lineno for node in methods[0].decorator_list]
-    first = min([methods[0].lineno, *decorators])
-    return "".join(source.splitlines(keepends=True)[first - 1 :])
+    first = next(node for node in definition.body if isinstance(node, ast.FunctionDef))
+    return "".join(source.splitlines(keepends=True)[_first_line(first) - 1 :])
+
+
+def _first_line(function: ast.FunctionDef) -> int:
+    """Of its decorators, if it has some."""
+    return min([function.lineno, *(each.lineno for each in function.decorator_list)])

@@ -22,20 +22,13 @@ COUNT = 16
 
 @dataclass(frozen=True)
 class Case:
-    """An adapter and the host to test it on.
-
-    Attributes:
-        driver: how the host is driven.
-        root: the folder of a miniature, of a checkout or of installed packages; it is only read.
-        examples: sequences of actions to try.
-        longest: length of the longest order of import, activation and deactivation to try.
-    """
+    """An adapter and the host to test it on."""
 
     adapter: HostAdapter
     driver: Host
-    root: Path
-    examples: int = 10
-    longest: int = 3
+    root: Path  # of a miniature, of a checkout or of installed packages; it is only read
+    examples: int = 10  # sequences of actions to try
+    longest: int = 3  # length of the longest order of import, activation and deactivation to try
 
     @property
     def repo(self) -> HostRepo:
