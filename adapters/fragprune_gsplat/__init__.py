@@ -7,7 +7,7 @@ and draws; strategies change rows through a handful of functions that treat ever
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
@@ -35,7 +35,14 @@ if TYPE_CHECKING:
 PACKAGE = "gsplat"
 RENDERING, OPERATIONS = f"{PACKAGE}.rendering", f"{PACKAGE}.strategy.ops"
 EXPORTER = f"{PACKAGE}.exporter"
+BASE = f"{PACKAGE}.strategy.base"
 DEFAULT, MCMC = f"{PACKAGE}.strategy.default", f"{PACKAGE}.strategy.mcmc"
+DRAWN = ("means", "opacities", "viewmats", "Ks", "covars")
+"""Arguments of ``rasterization``."""
+LPIPS = Seam(
+    Role.METRIC, "torchmetrics.image.lpip", "LearnedPerceptualImagePatchSimilarity", external=True
+)
+"""With what gsplat's trainer and nerfstudio measure."""
 ROWS = "fragprune_rows"
 """Key under which row numbers ride along while a strategy changes rows."""
 GROUPS = {
@@ -84,13 +91,13 @@ def tracing(call: SeamCall) -> Iterator[RowTrace]:
     trace.origins, trace.fresh = origins, fresh
 
 
-def answered(name: str) -> Callable[[SeamCall], Any]:
-    """Our answer to a function, imported when it is first called: it loads torch."""
+def answered(module: str, name: str, *needs: str, by: str) -> Seam:
+    """A function that one of ``answers`` answers, imported at the first call: it loads torch."""
 
     def how(call: SeamCall) -> Any:
-        return getattr(import_module("fragprune_gsplat.answers"), name)(call)
+        return getattr(import_module("fragprune_gsplat.answers"), by)(call)
 
-    return how
+    return Seam(Role.ANSWER, f"{PACKAGE}.{module}", name, needs, how=how)
 
 
 def splats_in(saved: Any) -> Tensor | None:
@@ -138,21 +145,10 @@ class Gsplat(HostAdapter):
     steps_by_rendering = True
     groups = (*HostAdapter.groups, ParamGroup("colors", colour=True))
     seams: tuple[Seam, ...] = (
-        Seam(
-            Role.RASTERIZE,
-            RENDERING,
-            "rasterization",
-            ("means", "opacities", "viewmats", "Ks", "covars"),
-        ),
+        Seam(Role.RASTERIZE, RENDERING, "rasterization", DRAWN),
         Seam(Role.VIEW, RENDERING, "rasterization", ("viewmats",)),
         Seam(Role.LOSS, "torch", "Tensor.backward", external=True),
-        Seam(
-            Role.ATTACH,
-            f"{PACKAGE}.strategy.base",
-            "Strategy.check_sanity",
-            ("params", "optimizers"),
-            how=optimizers,
-        ),
+        Seam(Role.ATTACH, BASE, "Strategy.check_sanity", ("params", "optimizers"), how=optimizers),
         _operation("duplicate", "mask"),
         _operation("split", "mask"),
         _operation("remove", "mask"),
@@ -163,21 +159,16 @@ class Gsplat(HostAdapter):
         Seam(Role.STILL, DEFAULT, "DefaultStrategy.step_pre_backward", ("params",)),
         Seam(Role.STILL, DEFAULT, "DefaultStrategy.step_post_backward", ("params",)),
         Seam(Role.STILL, MCMC, "MCMCStrategy.step_post_backward", ("params",)),
-        Seam(
-            Role.ANSWER,
-            f"{PACKAGE}.relocation",
-            "compute_relocation",
-            ("opacities", "scales", "ratios", "binoms"),
-            how=answered("relocation"),
+        answered(
+            *("relocation", "compute_relocation", "opacities", "scales", "ratios", "binoms"),
+            by="relocation",
         ),
-        Seam(
-            Role.ANSWER,
-            f"{PACKAGE}.cuda._wrapper",
-            "quat_scale_to_covar_preci",
-            ("quats", "scales", "compute_covar", "compute_preci", "triu"),
-            how=answered("covariance"),
+        answered(
+            *("cuda._wrapper", "quat_scale_to_covar_preci"),
+            *("quats", "scales", "compute_covar", "compute_preci", "triu"),
+            by="covariance",
         ),
-        Seam(Role.ANSWER, f"{PACKAGE}.distributed", "cli", ("fn", "args"), how=answered("alone")),
+        answered("distributed", "cli", "fn", "args", by="alone"),
         Seam(Role.SAVE, "torch", "save", ("f", "obj"), external=True),
         Seam(Role.UNPACK, "torch", "load", ("f",), external=True, how=read_again),
         Seam(Role.SAVE, EXPORTER, "export_splats", ("save_to", "means", "format")),

@@ -12,8 +12,15 @@ import torch
 from torch import Tensor
 
 from fragprune_graphdeco import stand_ins
-from fragprune_gsplat.harmonics import basis
-from fragprune_gsplat.projection import TILE, Projection, Rules, covariances, product, project
+from fragprune_gsplat.projection import (
+    TILE,
+    Projection,
+    Rules,
+    basis,
+    covariances,
+    product,
+    project,
+)
 from fragprune_plugins.adapting import (
     Dialect,
     Footprints,
@@ -50,35 +57,24 @@ MAX_DEGREE = 3
 
 @dataclass(frozen=True)
 class Cameras(RasterInputs):
-    """The inputs of the first camera, with those of the other cameras and all projections.
-
-    Attributes:
-        others: the inputs of the other cameras.
-        projections: the projections of all cameras.
-        shown: (C, N, 2) the projected means, or (nnz, 2) in packed calls. Strategies read their
-            gradients.
-    """
+    """The inputs of the first camera, with those of the other cameras and all projections."""
 
     others: tuple[RasterInputs, ...] = ()
     projections: tuple[Projection, ...] = ()
     shown: Tensor | None = None
+    """(C, N, 2) the projected means, or (nnz, 2) in packed calls; strategies read their gradients.
+    """
 
 
 @dataclass(frozen=True)
 class GsplatDialect(Dialect):
-    """The dialect of ``rasterization`` in one version.
-
-    Attributes:
-        alpha_max: the cap on alpha; gradients are zero where it applies.
-        floor: least antialiasing factor.
-        tight: radii are per axis and follow opacity; otherwise ``meta`` has one for both axes.
-    """
+    """The dialect of ``rasterization`` in one version."""
 
     means = "means"
     own_kernels = "gpu"
-    alpha_max: float
-    floor: float
-    tight: bool
+    alpha_max: float  # the cap on alpha; gradients are zero where it applies
+    floor: float  # least antialiasing factor
+    tight: bool  # radii are per axis and follow opacity; otherwise ``meta`` has one for both axes
 
     def unpack(self, call: HostCall) -> Cameras:
         """Project for every camera; the engine then only blends."""
@@ -115,7 +111,7 @@ class GsplatDialect(Dialect):
         self, call: HostCall, k: int, projection: Projection, means2d: Tensor
     ) -> RasterInputs:
         given = call.arguments
-        background = given["backgrounds"]
+        shown = given["backgrounds"] is not None and self._coloured(call)
         depth = "D" in given["render_mode"]
         viewmat, K = given["viewmats"][k].detach(), given["Ks"][k].detach()
         return RasterInputs(
@@ -125,9 +121,7 @@ class GsplatDialect(Dialect):
                 width=given["width"],
                 height=given["height"],
                 **{name: float(K[at]) for name, at in _INTRINSICS.items()},
-                background=None
-                if background is None or not self._coloured(call)
-                else background[k],
+                background=given["backgrounds"][k] if shown else None,
             ),
             splats=Footprints(
                 means2d=means2d - 0.5,
@@ -176,21 +170,17 @@ class GsplatDialect(Dialect):
                 raise InputError(where, repr(value)[:60], " or ".join(map(repr, known)), remedy)
         degree, colors = given["sh_degree"], given["colors"]
         trains = torch.is_grad_enabled() and given["means"].requires_grad and not call.still
+        absolute = "False until stage 2: our engines sum it over both axes"
         checks = (
             ("means", given["means"].ndim == 2, "(N, 3), no batches in front"),
             ("colors", colors is None or colors.shape[-1] == 3, "three channels"),
             ("sh_degree", degree is None or degree <= MAX_DEGREE, f"at most {MAX_DEGREE}"),
-            (
-                "absgrad",
-                not (given["absgrad"] and trains),
-                "False until stage 2: our engines sum it over both axes",
-            ),
+            ("absgrad", not (given["absgrad"] and trains), absolute),
         )
         for name, holds, expected in checks:
             if not holds:
-                raise InputError(
-                    f"gsplat.rasterization({name}=)", "another", expected, "Change the call."
-                )
+                where = f"gsplat.rasterization({name}=)"
+                raise InputError(where, "another", expected, "Change the call.")
 
     def answer(
         self, call: HostCall, inputs: RasterInputs, draw: Callable[..., RasterOutputs]
@@ -208,8 +198,7 @@ class GsplatDialect(Dialect):
         channels = [torch.stack([each.image for each in drawn])] if self._coloured(call) else []
         if "D" in mode:
             depths = torch.stack([d for each in drawn if (d := each.features) is not None])
-            expected = mode.endswith("ED")
-            weight = alphas.permute(0, 3, 1, 2).clamp_min(1e-10) if expected else 1.0
+            weight = alphas.permute(0, 3, 1, 2).clamp_min(1e-10) if "ED" in mode else 1.0
             channels.append(depths / weight)
         colors = torch.cat(channels, dim=1).permute(0, 2, 3, 1)
         return colors, alphas, self._meta(inputs, call)
@@ -223,16 +212,16 @@ class GsplatDialect(Dialect):
         }
         if not self.tight:
             stacked["radii"] = stacked["radii"][..., 0]
-        ids: tuple[Tensor | None, Tensor | None] = (None, None)
+        camera = row = batch = None
         if given["packed"]:
             visible = torch.stack([each.visible for each in inputs.projections])
             camera, row = visible.nonzero(as_tuple=True)
-            ids = camera, row
+            batch = torch.zeros_like(camera)
             stacked = {name: values[camera, row] for name, values in stacked.items()}
         return {
-            "batch_ids": None if ids[0] is None else torch.zeros_like(ids[0]),
-            "camera_ids": ids[0],
-            "gaussian_ids": ids[1],
+            "batch_ids": batch,
+            "camera_ids": camera,
+            "gaussian_ids": row,
             "means2d": inputs.shown,
             **stacked,
             "width": given["width"],

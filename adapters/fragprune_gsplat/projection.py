@@ -1,4 +1,4 @@
-"""gsplat's projection of Gaussians in torch, for one camera.
+"""gsplat's projection of Gaussians in torch, for one camera, and their harmonics.
 
 It differs from vanilla's: the Jacobian is clamped to the image's real bounds with the principal
 point. Since 1.5 extents are per axis and end where alpha falls below 1/255 or at 3.33 sigma;
@@ -19,51 +19,39 @@ EXTENT, SQUARE = 3.33, 3.0
 """In sigma, the furthest that gsplat looks: since 1.5 per axis, until 1.4 along the longer one."""
 MARGIN = 0.3
 """Of the tangent of the half field of view: how far beyond the image the Jacobian is evaluated."""
+C0 = 0.28209479177387814
+C1 = 0.4886025119029199
+C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
+C3 = (-0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154)
+C3_2 = 1.445305721320277
+"""Of real spherical harmonics with the signs of 3DGS."""
 
 
 @dataclass(frozen=True)
 class Rules:
-    """Settings of the projection, from the call and the installed version.
+    """Settings of the projection, from the call and the installed version."""
 
-    Attributes:
-        eps2d: pixels^2 added to the 2D covariance's diagonal.
-        near: view depth below which a Gaussian is culled.
-        far: view depth above which a Gaussian is culled.
-        radius_clip: pixels; radii up to it are culled.
-        antialiased: opacity is multiplied by sqrt(det before / det after eps2d).
-        floor: least value of that factor.
-        tight: extents are per axis and follow opacity; otherwise they are squares, and Gaussians
-            of any opacity count as visible.
-    """
-
-    eps2d: float
-    near: float
-    far: float
-    radius_clip: float
-    antialiased: bool
-    floor: float
+    eps2d: float  # pixels^2 added to the 2D covariance's diagonal
+    near: float  # view depth below which a Gaussian is culled
+    far: float  # likewise above
+    radius_clip: float  # pixels; radii up to it are culled
+    antialiased: bool  # opacity is multiplied by sqrt(det before / det after eps2d)
+    floor: float  # least value of that factor
     tight: bool
+    """Extents are per axis and follow opacity; otherwise they are squares, and Gaussians of any
+    opacity count as visible."""
 
 
 @dataclass(frozen=True)
 class Projection:
-    """N Gaussians as one camera sees them; rows that are culled have radii 0.
+    """N Gaussians as one camera sees them; rows that are culled have radii 0."""
 
-    Attributes:
-        radii: (N, 2) int32 pixels, per axis.
-        means2d: (N, 2) pixels; the first pixel's centre is (0.5, 0.5).
-        depths: (N,) view depth.
-        conics: (N, 3) inverse covariances xx, xy, yy.
-        opacities: (N,) compensated where the call asks for it.
-        tiles: (N, 4) int32 half-open rectangle of tiles.
-    """
-
-    radii: Tensor
-    means2d: Tensor
-    depths: Tensor
-    conics: Tensor
-    opacities: Tensor
-    tiles: Tensor
+    radii: Tensor  # (N, 2) int32 pixels, per axis
+    means2d: Tensor  # (N, 2) pixels; the first pixel's centre is (0.5, 0.5)
+    depths: Tensor  # (N,) view depth
+    conics: Tensor  # (N, 3) inverse covariances xx, xy, yy
+    opacities: Tensor  # (N,) compensated where the call asks for it
+    tiles: Tensor  # (N, 4) int32 half-open rectangle of tiles
 
     @property
     def visible(self) -> Tensor:
@@ -159,3 +147,20 @@ def project(
         tiles = torch.where(drawn[:, None], torch.cat([first, last], dim=-1), 0.0).int()
     conics = torch.stack([c / det, -b / det, a / det], dim=-1)
     return Projection(radii.int(), means2d, depths, conics, opacities, tiles)
+
+
+def basis(directions: Tensor, degree: int) -> Tensor:
+    """(N, (degree + 1)^2) real spherical harmonics of unit directions (N, 3), signs as in 3DGS."""
+    x, y, z = directions.unbind(-1)
+    values = [torch.full_like(x, C0)]
+    if degree > 0:
+        values += [-C1 * y, C1 * z, -C1 * x]
+    if degree > 1:
+        xx, yy, zz = x * x, y * y, z * z
+        values += [C2[0] * x * y, C2[1] * y * z, C2[2] * (2 * zz - xx - yy)]
+        values += [C2[1] * x * z, C2[3] * (xx - yy)]
+    if degree > 2:
+        values += [C3[0] * y * (3 * xx - yy), C3[1] * x * y * z, C3[2] * y * (4 * zz - xx - yy)]
+        values += [C3[3] * z * (2 * zz - 3 * xx - 3 * yy), C3[2] * x * (4 * zz - xx - yy)]
+        values += [C3_2 * z * (xx - yy), C3[0] * x * (xx - 3 * yy)]
+    return torch.stack(values, dim=-1)

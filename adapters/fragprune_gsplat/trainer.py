@@ -15,7 +15,7 @@ from typing import Any
 import torch
 
 from fragprune_graphdeco import stand_ins
-from fragprune_gsplat import DEFAULT, MCMC, Gsplat
+from fragprune_gsplat import DEFAULT, LPIPS, MCMC, Gsplat
 from fragprune_gsplat.dialect import GsplatDialect
 from fragprune_plugins.adapting import (
     CommandLine,
@@ -23,9 +23,7 @@ from fragprune_plugins.adapting import (
     HostRepo,
     NotComparedError,
     Photographs,
-    Role,
     ScriptAdapter,
-    Seam,
     UsageError,
 )
 
@@ -43,6 +41,7 @@ ONLY = {
 """Flags with values that stage 2 cannot follow; these values it can."""
 NEAR = 0.01
 """The near plane of ``rasterization``."""
+_OWN_FIGURES = "Compare its own figures of held-out views, stats/val_step*.json in --result_dir."
 DEFINES = ("create_splats_with_optimizers", "Runner.train", "main")
 
 
@@ -89,15 +88,7 @@ class TrainerDialect(GsplatDialect):
 class SimpleTrainer(Gsplat, ScriptAdapter):
     """The adapter of a copy of the script, with the installed gsplat."""
 
-    seams = (
-        *Gsplat.seams,
-        Seam(
-            Role.METRIC,
-            "torchmetrics.image.lpip",
-            "LearnedPerceptualImagePatchSimilarity",
-            external=True,
-        ),
-    )
+    seams = (*Gsplat.seams, LPIPS)
 
     def __init__(self, script: Path) -> None:
         self.script = script
@@ -146,12 +137,10 @@ class SimpleTrainer(Gsplat, ScriptAdapter):
 
     def densified(self, repo: HostRepo, script: Path, arguments: list[str]) -> int | None:
         """The strategy's ``refine_stop_iter``."""
-        module, kind = (
-            (MCMC, "MCMCStrategy") if "mcmc" in arguments else (DEFAULT, "DefaultStrategy")
-        )
-        stated = given(arguments).get("strategy.refine-stop-iter")
-        if stated:
+        if stated := given(arguments).get("strategy.refine-stop-iter"):
             return int(stated[0])
+        default = DEFAULT, "DefaultStrategy"
+        module, kind = (MCMC, "MCMCStrategy") if "mcmc" in arguments else default
         return defaults(repo.tree(module), kind).get("refine_stop_iter")
 
     def _fields(self) -> dict[str, Any]:
@@ -169,12 +158,9 @@ class SimpleTrainer(Gsplat, ScriptAdapter):
         if flags.get("test-every", ["8"]) != ["8"]:
             found.append("other held-out views than every eighth")
         if found:
-            raise NotComparedError(
-                "gsplat's simple_trainer",
-                ", ".join(found),
-                "--no-normalize-world-space --save_ply, and --test_every as it is",
-                "Compare its own figures of held-out views, stats/val_step*.json in --result_dir.",
-            )
+            where = "gsplat's simple_trainer"
+            expected = "--no-normalize-world-space --save_ply, and --test_every as it is"
+            raise NotComparedError(where, ", ".join(found), expected, _OWN_FIGURES)
         factor = flags.get("data-factor", [str(self._fields()["data_factor"])])[0]
         images = "images" if factor == "1" else f"images_{factor}"
         folder = Path(flags["data-dir"][0])
@@ -188,12 +174,8 @@ class SimpleTrainer(Gsplat, ScriptAdapter):
         """
         flags, names = given(arguments), [word.replace("_", "-") for word in arguments]
         if "far-plane" in flags:
-            raise NotComparedError(
-                "gsplat's simple_trainer",
-                "a far plane, which our readers do not have",
-                "pictures as the script draws them",
-                "Compare its own figures of held-out views, stats/val_step*.json in --result_dir.",
-            )
+            where, found = "gsplat's simple_trainer", "a far plane, which our readers do not have"
+            raise NotComparedError(where, found, "pictures as the script draws them", _OWN_FIGURES)
         near = flags.get("near-plane", [self._fields().get("near_plane", NEAR)])[0]
         rules: dict[str, Any] = {"near": float(near), "alpha_max": self.dialect(repo).alpha_max}
         asked = [name for name in names if name in ("--antialiased", "--no-antialiased")]

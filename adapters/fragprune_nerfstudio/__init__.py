@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fragprune_gsplat import DRAWN, LPIPS, Gsplat
 from fragprune_plugins.adapting import (
     AlignmentError,
     Dialect,
@@ -105,20 +106,9 @@ class Nerfstudio(HostAdapter):
         Seam(Role.STEP, SPLATFACTO, "SplatfactoModel.step_cb", ("optimizers", "step")),
         Seam(Role.VIEW, SPLATFACTO, "SplatfactoModel.get_outputs", ("camera",)),
         # gsplat's function under the name by which the model calls it
-        Seam(
-            Role.RASTERIZE,
-            SPLATFACTO,
-            "rasterization",
-            ("means", "opacities", "viewmats", "Ks", "covars"),
-            external=True,
-        ),
+        Seam(Role.RASTERIZE, SPLATFACTO, "rasterization", DRAWN, external=True),
         Seam(Role.LOSS, "torch", "Tensor.backward", external=True),
-        Seam(
-            Role.METRIC,
-            "torchmetrics.image.lpip",
-            "LearnedPerceptualImagePatchSimilarity",
-            external=True,
-        ),
+        LPIPS,
         Seam(
             Role.PACK,
             f"{PACKAGE}.scripts.exporter",
@@ -137,7 +127,6 @@ class Nerfstudio(HostAdapter):
 
     def dialect(self, repo: HostRepo) -> Dialect:
         """That of the installed gsplat."""
-        from fragprune_gsplat import Gsplat
         from fragprune_nerfstudio.dialect import NerfstudioDialect
 
         gsplat = Gsplat().dialect(HostRepo.installed("gsplat") or repo)

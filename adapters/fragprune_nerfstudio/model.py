@@ -7,8 +7,8 @@ the thresholds. It starts a session of fragprune, which does the rest: this modu
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from copy import copy
 from dataclasses import dataclass, field
 from functools import partial
@@ -317,10 +317,6 @@ def expect_no_script() -> None:
         raise AlignmentError("nerfstudio.scripts.exporter", found, "the command ns-export", remedy)
 
 
-@contextmanager
-def _on_cpu(cpu: bool) -> Iterator[None]:
+def _on_cpu(cpu: bool) -> AbstractContextManager[Any]:
     """Inside, nothing goes to a GPU where the model is on the CPU."""
-    with ExitStack() as stack:
-        if cpu:
-            stack.enter_context(_NoCuda())
-        yield
+    return _NoCuda() if cpu else nullcontext()

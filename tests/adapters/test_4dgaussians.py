@@ -13,8 +13,7 @@ import torch
 from miniatures import runs
 from miniatures.moving import MovingHost
 
-from fragprune_4dgaussians import MovingGaussians
-from fragprune_4dgaussians.config import PythonFile
+from fragprune_4dgaussians import MovingGaussians, PythonFile
 from fragprune_plugins.errors import HostFailed, ModelFileError, UsageError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection.launch import run
