@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -56,11 +57,10 @@ def _generated(
 ) -> list[timing.Case]:
     """A generated scene for each count of Gaussians and image size."""
     cases: list[timing.Case] = []
-    for count in gaussians:
-        for size in sizes:
-            splats, view = make_scene(count).to(device).splats(), make_view(*size).to(device)
-            cut = torch.full_like(splats.opacities, timing.TRUNCATION)
-            cases += timing.cases(f"bench-{count}", view, splats, cut, {})
+    for count, size in product(gaussians, sizes):
+        splats, view = make_scene(count).to(device).splats(), make_view(*size).to(device)
+        cut = torch.full_like(splats.opacities, timing.TRUNCATION)
+        cases += timing.cases(f"bench-{count}", view, splats, cut, {})
     return cases
 
 

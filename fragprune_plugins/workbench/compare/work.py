@@ -57,24 +57,10 @@ def compare(
         shown = f"{photographs.folder}"
     shots = opening.chosen(dataset, views)
     before, after = measure_all(candidates, shots, engine=rasterizer, enlarge=enlarge)
-    measured = [(str(a), before), (str(b), after)]
-    report = _figures(measured, enlarge, photographs)
-    lines = _lines(measured, report, shown, [shot.view for shot in shots])
-    if out is not None:
-        columns = dict(zip("AB", candidates, strict=True))
-        lines.append(leave_panels(out, "compare", report, columns, shots, rasterizer))
-    return Report(report, "\n".join(lines))
-
-
-def _figures(
-    measured: list[tuple[str, dict[str, Any]]], enlarge: int, photographs: Photographs | None
-) -> dict[str, Any]:
-    """What --json prints, of the measurements of A and B by their paths."""
-    (a, before), (b, after) = measured
     drawn = [each["fragments_per_pixel"] for each in (before, after)]
-    return {
-        "a": {"model": a} | before,
-        "b": {"model": b} | after,
+    report: dict[str, Any] = {
+        "a": {"model": str(a)} | before,
+        "b": {"model": str(b)} | after,
         "target": after["target"],
         "speedup": drawn[0] / drawn[1] if drawn[1] else None,
         "psnr_change": after["psnr"] - before["psnr"],
@@ -85,27 +71,26 @@ def _figures(
         "scene": records.plain(photographs) if photographs else None,
         "warnings": wording.nothing_drawn(drawn) + wording.unrelated(before, after),
     }
+    lines = _lines(report, shown, [shot.view for shot in shots])
+    if out is not None:
+        columns = dict(zip("AB", candidates, strict=True))
+        lines.append(leave_panels(out, "compare", report, columns, shots, rasterizer))
+    return Report(report, "\n".join(lines))
 
 
-def _lines(
-    measured: list[tuple[str, dict[str, Any]]],
-    report: dict[str, Any],
-    shown: str,
-    views: Sequence[View],
-) -> list[str]:
+def _lines(report: dict[str, Any], shown: str, views: Sequence[View]) -> list[str]:
     """What a person reads."""
-    (a, before), (b, after) = measured
-    enlarge = report["enlarge"]
+    a, b, enlarge = report["a"], report["b"], report["enlarge"]
     size, large = (
         wording.sizes([(times * view.width, times * view.height) for view in views])
         for times in (1, enlarge)
     )
     pictures = "Photographs" if report["scene"] else "Pictures"
     return [
-        f"A: {a}\nB: {b}\n{pictures}: {shown}, {size} pixels\n",
-        wording.describe({"A": before, "B": after}),
+        f"A: {a['model']}\nB: {b['model']}\n{pictures}: {shown}, {size} pixels\n",
+        wording.describe({"A": a, "B": b}),
         *([f"Frames of {large} pixels."] if enlarge > 1 else []),
-        f"\nB against A: {wording.gain(before, after, enlarge)}.",
+        f"\nB against A: {wording.gain(a, b, enlarge)}.",
         *(f"Warning: {each}" for each in report["warnings"]),
     ]
 
