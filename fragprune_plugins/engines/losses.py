@@ -50,7 +50,8 @@ def compiled_loss(
         x, y = plain(image), plain(target)
         channels, height, width = x.shape
         workspace = _workspace(opened)
-        gradients.extend(empty(workspace, *x.shape) for _ in wanted)
+        if wanted:
+            gradients.append(empty(workspace, *x.shape))
         images = binding.Photometric(
             threads=native_threads(),
             channels=channels,
