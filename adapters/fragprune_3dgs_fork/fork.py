@@ -394,13 +394,10 @@ def _not_resumed(repo: HostRepo, script: str, tree: ast.Module) -> Iterator[str]
     if any(node.lineno > read.get(name, node.lineno) for node, name in assigned):
         yield f"{script} does not go on at the iteration of its checkpoint"
     capture = methods["capture"]
-    taken, state = _taken_back(methods["restore"]), _state(capture)
-    if not any("optimizer.state_dict()" in text_of(each) for each in state):
+    if not any("optimizer.state_dict()" in text_of(each) for each in reading.state(capture)):
         yield "its checkpoints have no state of an optimizer"
-    fixed = [each for each in state if not isinstance(each, ast.Starred)]
-    more = len(state) - len(fixed)
-    if taken and not any(n >= len(fixed) if more else n == len(fixed) for n in taken):
-        yield f"its restore takes {taken[0]} values, and capture gives {len(state)}"
+    if uneven := reading.uneven(capture, methods["restore"]):
+        yield uneven
     whole = re.findall(r"self\.(\w+)(?=[,)])", text_of(capture))
     trained = re.findall(r"self\.(\w+)\.parameters\(", text_of(repo.tree(MODEL)))
     if networks := sorted({*whole} & {*trained}):
@@ -524,21 +521,6 @@ def plain_distances(repo: HostRepo) -> bool:
     taken = [each.value for each in every(tree, ast.Subscript)]
     taken += [value for target, value in assigned(tree) if isinstance(target, ast.Tuple)]
     return not any(text_of(each).startswith("distCUDA2(") for each in taken)
-
-
-def _state(capture: Function) -> list[ast.expr]:
-    """What a method returns as a tuple, the longest of several."""
-    given = (node.value for node in every(capture, ast.Return))
-    listed = (each.elts for each in given if isinstance(each, ast.Tuple | ast.List))
-    return max(listed, key=len, default=[])
-
-
-def _taken_back(restore: Function) -> list[int]:
-    """Into how many values a method unpacks its first argument."""
-    first = [each.arg for each in restore.args.args[1:2]]
-    unpacked = (to for to, value in assigned(restore) if text_of(value) in first)
-    several = (each for each in unpacked if isinstance(each, ast.Tuple))
-    return [len(each.elts) for each in several if not every(each, ast.Starred)]
 
 
 def _assigned(body: ast.AST, owner: str = "") -> Iterator[tuple[ast.AST, str]]:
@@ -687,10 +669,10 @@ def _read_draws(fork: Fork) -> None:
                 other = plain.Drawing(repo, RENDERER, body, call=node)
                 for found in (why for why, moves in other.shapes() if not moves):
                     refuse(found, "the model's own Gaussians")
+                if selected := other.selection():
+                    refuse(f"draws a selection, {selected}", "all rows")
         for cut in [*source.cuts()][:1]:
             refuse(f"a picture of more channels, {text_of(cut)}", "a picture")
-        if selected := source.selection():
-            refuse(f"draws a selection, {selected}", "all rows")
         fork.colours |= source.colours
     if not fork.draws and not any(each.code == "rasterizer-call" for each in fork.findings):
         at = f"{RENDERER} ({repo.place(RENDERER, 'render')})"

@@ -165,9 +165,10 @@ class MovingGaussians(GraphdecoAdapter):
     )
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
-        """Also that its script trains "fine", to which stage 2 belongs."""
-        trains = re.search(r"[(,] ?'fine'", ast.unparse(repo.tree("train") or ast.Pass()))
-        missing = [] if trains else ["no phase fine in train.py"]
+        """Also that its script trains "fine", to which stage 2 belongs, and names it."""
+        text = ast.unparse(repo.tree("train") or ast.Pass())
+        missing = [] if re.search(r"[(,] ?'fine'", text) else ["no phase fine in train.py"]
+        missing += [] if "_{stage}_" in text else ["no checkpoints of a phase in train.py"]
         return [*super().fingerprint(repo), *self.other_host(repo, missing)]
 
     # -- its command line ------------------------------------------------------------------------

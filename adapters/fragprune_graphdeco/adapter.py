@@ -279,6 +279,11 @@ class GraphdecoAdapter(ScriptAdapter):
             made = reading.made_models(repo, module_of(script))
             if made and "GaussianModel" not in made:
                 missing.append(f"{script} makes {', '.join(dict.fromkeys(made))}")
+            rate = [] if self.steps_by_rendering or not made else ["update_learning_rate"]
+            called = repo.mentions([module_of(script)], rate)
+            missing += [f"{script} calls no {each}" for each in rate if each not in called]
+        both = (repo.function(MODEL, f"GaussianModel.{name}") for name in ("capture", "restore"))
+        missing += filter(None, [reading.uneven(*both)])
         for module, _, name in (each.rpartition(":") for each in self.own_names):
             module = module or MODEL
             missing += [] if repo.mentions([module], [name]) else [f"no {name} in {module}"]

@@ -38,7 +38,7 @@ _OF_MODEL = re.compile(
 """Attributes of the model that a plain drawing reads."""
 _OF_CALL = re.compile(
     r"view\w*|cam\w*|\w*pose\w*|pipe\w*|scal\w*|override_color|\w*mask\w*|bg\w*|xyz|means3D|"
-    r"opacity|opacities|features|shs|rotations?|\w*sh\w*"
+    r"opacity|opacities|features|shs|dc|rotations?|\w*sh\w*"
 )
 """Parameters of a drawing function that move or select Gaussians, or are their values."""
 _KEEPS = ("clamp", "clamp_", "contiguous", "squeeze", "unsqueeze", "to", "permute")
@@ -152,8 +152,9 @@ def _saving(repo: HostRepo, modules: Iterable[str], *methods: str) -> Iterator[M
 
 def _trained(repo: HostRepo) -> list[str]:
     """The training scripts and what they import of a codebase."""
-    deeper = (f"{path.parent.name}.{path.stem}" for path in sorted(repo.root.glob("*/*train*.py")))
-    return [*reading.reached(repo, [*_training(repo), *deeper])]
+    deeper = [f"{path.parent.name}.{path.stem}" for path in sorted(repo.root.glob("*/*train*.py"))]
+    others = (each.stem for each in sorted(repo.root.glob("*.py")))
+    return [*reading.reached(repo, [*_training(repo), *deeper] or others)]
 
 
 def _of_others(model: ModelClass) -> Iterator[str]:
@@ -197,8 +198,16 @@ def _of_columns(model: ModelClass) -> Iterator[str]:
         yield f"its PLY lacks the columns {', '.join(missing)} ({at})"
     if listed is not None and listed.name != "save_ply":
         for each in names:
-            if says := change_of(each):
+            if (says := change_of(each)) and each not in _seen(model.repo):
                 yield f"its PLY also holds {each}, {says} ({at})"
+
+
+def _seen(repo: HostRepo) -> set[str]:
+    """Masks that a rasterizer takes and gives a picture of, beside that of the colours."""
+    drawing = (each for module in _renderers(repo)[:1] for each in _drawing(repo, module)[:1])
+    pairs = [(to, value) for each in drawing for to, value in assigned(each)]
+    calls = [(text_of(to), value) for to, value in pairs if arguments(value).keys() & {"mask"}]
+    return {"mask" for to, _ in calls if re.search(r"\w+_mask\b", to)}
 
 
 def _scales(model: ModelClass) -> Iterator[str]:
@@ -210,7 +219,7 @@ def _scales(model: ModelClass) -> Iterator[str]:
     )
     joined = " ".join(re.findall(r"\bcat\([\[(](.*?)[\])]", " ".join(map(text_of, setup))))
     for each in (node for part in body for node in every(part, ast.Assign)):
-        wide = re.search(r"\.repeat\(1, ([12])\)$", text_of(each.value))
+        wide = re.search(r"\.repeat\(1, ([12])\)( if .*)?$", text_of(each.value))
         target = text_of(each.targets[0])
         if wide and target not in joined and (each in setup or "scal" in target):
             what = "flat, with two scales" if wide[1] == "2" else "round, with one scale"
@@ -569,8 +578,10 @@ class Drawing:
 
     def selection(self) -> str:
         """The code that picks rows of what is drawn first, as ``means3D[mask]``; "" without any."""
+        gone = reading.skipped(self.function, self._known)  # by what is off
+        given = {} if self.call in gone else self.arguments
         own, seen = f"{self.model}.get_xyz", set()
-        waiting = [value for name, value in self.arguments.items() if name == "means3D"]
+        waiting = [value for name, value in given.items() if name == "means3D"]
         while waiting:
             for node in ast.walk(waiting.pop()):
                 if isinstance(node, ast.Name) and node.id not in seen:

@@ -190,6 +190,7 @@ def failing(repo: HostRepo, scripts: Collection[str]) -> list[str]:
         for node in learning(tree):
             if any("torch.compile" in text_of(each) for each in node.decorator_list):
                 found.append(f"{script} compiles {node.name}, which trains")
+        found += [*_broken(repo, module)][:1]
         found += (*_misfits(repo, module), *_absent(repo, module), *_own_folders(repo, module))[:1]
         found += [f"{script} draws by {each}" for each in _drawn_elsewhere(repo, module)][:1]
     return found
@@ -207,6 +208,24 @@ def _imported_elsewhere(repo: HostRepo) -> Iterator[str]:
                 ):
                     at = repo.at(module, node.lineno)
                     yield f"{at} imports {name}, which is no module of this folder"
+
+
+_OWN = ("arguments", "gaussian_renderer", "scene", "utils")
+"""Packages that a codebase of this family has itself."""
+
+
+def _broken(repo: HostRepo, module: str) -> Iterator[str]:
+    """Modules that a script cannot import; a script in a folder may have others beside it."""
+    own = [each for each in _OWN if (repo.root / each).is_dir()] if "." not in module else []
+    for name, tree in reached(repo, [module]).items():
+        for node in (each for each in tree.body if isinstance(each, ast.Import | ast.ImportFrom)):
+            at, names = repo.at(name, node.lineno), repo.imported_by(name, node)
+            for each in (each for each in names if repo.path(each) and repo.tree(each) is None):
+                yield f"imports {each}, which is no valid Python ({at})"
+            top, path = names[0].split(".")[0], names[0].replace(".", "/")
+            there = (repo.root / path).is_dir() or any(repo.root.glob(f"{path}.*"))
+            if top in (*own, "train") and not there:
+                yield f"imports {names[0]}, which is not there ({at})"
 
 
 def learning(tree: ast.AST | None) -> list[ast.FunctionDef]:
@@ -235,14 +254,23 @@ _ROWS = re.compile(r"xyz|self\.(_|get_)xyz(\.\w+\(\))*")
 
 
 def _drawn_elsewhere(repo: HostRepo, module: str) -> Iterator[str]:
-    """Functions beside ``gaussian_renderer`` by which a script draws, where that has its own."""
-    usual = "gaussian_renderer"
+    """Functions beside ``gaussian_renderer`` by which a script draws, where that has its own, and
+    functions in it without a rasterizer of 3DGS that draw in the place of others.
+    """
+    usual, known = "gaussian_renderer", as_options(repo, ("arguments", module))
     for node in every(repo.tree(module), ast.ImportFrom):
         beside = repo.absolute(module, node)
+        for body in (repo.function(usual, each.name) for each in node.names if beside == usual):
+            gone = skipped(body, known)
+            for made in (each for each in every(body, ast.Return) if each not in gone):
+                name = getattr(getattr(made.value, "func", None), "id", "")
+                other = repo.function(usual, name)
+                if other and entries(other, "render") and "GaussianRasteriz" not in text_of(other):
+                    yield f"{name}, which calls no rasterizer of 3DGS"
         for each in node.names if beside.startswith(f"{usual}.") else ():
-            home, body = _definition(repo, beside, each.name)
+            home, found = _definition(repo, beside, each.name)
             own = _definition(repo, usual, each.name)[0]
-            if own and home != own and "GaussianRasterizer(" in text_of(body):
+            if own and home != own and "GaussianRasterizer(" in text_of(found):
                 yield f"{each.name} of {home}, not of {usual}"
 
 
@@ -297,14 +325,18 @@ def _misfits(repo: HostRepo, module: str) -> tuple[str, ...]:
 
 
 def _own_folders(repo: HostRepo, module: str) -> Iterator[str]:
-    """Folders of data and output that a script sets itself, whatever its command says."""
+    """Folders of data and output, or all options, that a script sets whatever its command says."""
     body = getattr(repo.tree(module), "body", ())
     asked = [node for node in body if isinstance(node, ast.If)]
     main = [each for node in asked if "__name__" in text_of(node.test) for each in node.body]
     for node in (each for each in (*body, *main) if isinstance(each, ast.Assign)):
-        name = getattr(node.targets[0], "attr", "")
+        name, at = getattr(node.targets[0], "attr", ""), repo.at(module, node.lineno)
         if name in ("source_path", "model_path") and f".{name}" not in text_of(node.value):
-            yield f"sets {name} itself, whatever its command says ({repo.at(module, node.lineno)})"
+            yield f"sets {name} itself, whatever its command says ({at})"
+        called = getattr(getattr(node.value, "func", None), "id", "")
+        made = _definition(repo, module, called)[1]
+        if isinstance(made, ast.FunctionDef) and "setattr(" in text_of(made):
+            yield f"sets options by {called}, whatever its command says ({at})"
 
 
 _ANY = "any key"
@@ -347,7 +379,9 @@ def _given(repo: HostRepo, name: str) -> set[str]:
         made += node.args if owner in named and method == "update" else []
     texts = {str(each.value) for each in every(body, ast.Constant)}
     dicts = [each for each in made if isinstance(each, ast.Dict) and None not in each.keys]
-    return texts if "render" in texts and dicts and len(dicts) == len(made) else set()
+    calls = any(isinstance(node.value, ast.Call) for node in every(body, ast.Return))
+    known = "render" in texts and dicts and len(dicts) == len(made) and not calls
+    return texts if known else set()
 
 
 def _key(node: ast.AST) -> str:
@@ -539,6 +573,31 @@ def options(model: ModelClass, scripts: Iterable[str]) -> set[str]:
     names = {each: each.split(".")[-1] for each in asked}
     off = {each for each in asked if off_in(model.repo, ("arguments",), names[each])}
     return {each for each in off if names[each] not in made}
+
+
+def state(capture: Function | None) -> list[ast.expr]:
+    """What a method returns as a tuple, the longest of several."""
+    given = (node.value for node in every(capture, ast.Return))
+    listed = (each.elts for each in given if isinstance(each, ast.Tuple | ast.List))
+    return max(listed, key=len, default=[])
+
+
+def _taken_back(restore: Function | None) -> list[int]:
+    """Into how many values a method unpacks its first argument."""
+    first = [each.arg for each in restore.args.args[1:2]] if restore else []
+    unpacked = (to for to, value in assigned(restore) if getattr(value, "id", "") in first)
+    several = (each for each in unpacked if isinstance(each, ast.Tuple))
+    return [len(each.elts) for each in several if not every(each, ast.Starred)]
+
+
+def uneven(capture: Function | None, restore: Function | None) -> str:
+    """How a method takes back another number of values than one gives; "" if it does not."""
+    taken, given = _taken_back(restore), state(capture)
+    fixed = [each for each in given if not isinstance(each, ast.Starred)]
+    more = len(given) - len(fixed)
+    if not given or not taken or any(n >= len(fixed) if more else n == len(fixed) for n in taken):
+        return ""
+    return f"its restore takes {taken[0]} values, and capture gives {len(given)}"
 
 
 SCRIPTS = ("*train*.py", "*.py")

@@ -184,6 +184,8 @@ def test_a_folder_that_is_no_host(tmp_path):
 def test_what_a_training_wrote_is_not_judged_as_a_host(tmp_path):
     (tmp_path / "cfg_args").touch()
     fails("check", tmp_path, says=("the output folder of a training", "fragprune audit"), code=1)
+    (tmp_path / "train.py").touch()  # its checkout, to which a training wrote
+    assert "the output folder" not in refused(tmp_path)["reason"]
 
 
 def test_a_folder_whose_scripts_use_the_one_above_names_it(host):

@@ -616,6 +616,7 @@ OVERRULES = {
     "a folder by a name of its own": ("args.model_path = os.path.join('out', now())", False),
     "the same, whole": ("args.source_path = os.path.abspath(args.source_path)", True),
     "another option": ("args.images = 'images_4'", True),
+    "options of a file": ("args = overruled(args, read(args.config))", False),
     "where none is given": ("if not args.model_path:\n        args.model_path = 'out'", True),
 }
 
@@ -623,9 +624,10 @@ OVERRULES = {
 @pytest.mark.parametrize("what", OVERRULES)
 def test_a_script_that_overrules_the_folders_of_its_command_is_refused(tmp_path, what):
     sets, served = OVERRULES[what]
-    main = f"\nif __name__ == '__main__':\n    {sets}\n{PARSES}"
+    rules = "\n\ndef overruled(args, options):\n    setattr(args, *options)\n    return args\n"
+    main = f"{rules}\nif __name__ == '__main__':\n    {sets}\n{PARSES}"
     found = errors(fork(tmp_path, (PARSES, main)))
-    assert found == [] if served else "itself, whatever its command says" in found[0]
+    assert found == [] if served else "whatever its command says" in found[0]
 
 
 MOVED = [
@@ -976,6 +978,49 @@ def test_a_script_draws_by_a_function_that_has_a_seam(tmp_path, again):
         usual.write_text("from gaussian_renderer.mine import render\n")
     found = "; ".join(errors(repo))
     assert ("train.py draws by render of gaussian_renderer.mine" in found) == (not again)
+
+
+@pytest.mark.parametrize("asked", ["fast", "pipe.fast"])
+def test_a_function_without_a_rasterizer_draws_in_the_place_of_no_other(tmp_path, asked):
+    quick = "    s = Gaussian", f"    if {asked}:\n        return quick(pc)\n    s = Gaussian"
+    flags = PARSES, f"\nparser.add_argument('--fast', default=False)\n{PARSES}"
+    repo = fork(tmp_path, quick, flags, ('package["render"]', 'package["seen"]'))
+    renderer = tmp_path / "gaussian_renderer/__init__.py"
+    draws = "def quick(pc):\n    return {'render': backend(pc.get_xyz), 'seen': pc.get_xyz}\n"
+    renderer.write_text(renderer.read_text() + draws)
+    found = "; ".join(errors(repo))
+    assert ("draws by quick, which calls no rasterizer of 3DGS" in found) == (asked == "fast")
+    assert "which has no such value" not in found
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("helpers", "def f():\n", "imports helpers, which is no valid Python (scene/tools.py:1)"),
+        ("helpers", "def f(): ...\n", ""),
+        ("helpers", None, ""),  # an installed package
+        ("train", None, "imports train, which is not there (scene/tools.py:1)"),
+        ("scene.helpers", None, "imports scene.helpers, which is not there (scene/tools.py:1)"),
+    ],
+)
+def test_a_script_that_cannot_import_its_own_modules_is_refused(tmp_path, name, text, said):
+    tools = "from scene import tools, GaussianModel"
+    repo = fork(tmp_path, ("from scene import GaussianModel", tools), script="train_scene.py")
+    (tmp_path / "scene/tools.py").write_text(f"from {name} import f\n")
+    if text:
+        (tmp_path / f"{name}.py").write_text(text)
+    found = "; ".join(errors(repo))
+    assert (f"train_scene.py: {said}" in found) if said else not found
+
+
+def test_a_second_draw_of_some_rows_alone_is_refused(tmp_path):
+    some = (
+        "    far, _ = rasterizer(means3D=pc.get_xyz[big], opacities=pc.get_opacity[big], shs=shs)\n"
+    )
+    found = errors(fork(tmp_path, (KEYS, f"{some}{KEYS}")))
+    assert "draws a selection, pc.get_xyz[big]" in str(found)
+    asked = f"    if chosen is not None:\n    {some}"
+    assert errors(fork(tmp_path, (KEYS, f"{asked}{KEYS}"))) == []
 
 
 def test_what_a_script_changes_until_densification_ends_ends_before_stage_2(tmp_path):

@@ -241,6 +241,11 @@ def test_the_nearest_host_is_of_this_family(fork):
         ('"opacity"]', '"opacity", "binding_0"]', "binding, positions relative to the triangles"),
         ('names.append("f_dc_{}".format(i))', "...", "lacks the columns f_dc"),
         (".repeat(1, 3)", ".repeat(1, 2)", "flat, with two scales"),
+        (
+            ".repeat(1, 3)",
+            ".repeat(1, 2) if flat else scales.repeat(1, 3)",
+            "flat, with two scales",
+        ),
         (".repeat(1, 3)", "", "its Gaussians are round, with one scale"),
         (".repeat(1, 3)", ".repeat(1, 1)", "its Gaussians are round, with one scale"),
         ("means3D=means3D, ", "means3D + pc.net(view), ", "makes means3D from pc.net"),
@@ -339,6 +344,20 @@ def test_values_in_further_columns_that_a_rasterizer_takes_make_another_picture(
     assert reasons == ("its rasterizer also takes vi",)
 
 
+@pytest.mark.parametrize("seen", ["rendered_mask", "depth"])
+def test_a_mask_of_which_a_rasterizer_gives_a_picture_scales_no_opacities(fork, seen):
+    taken = ("shs=shs, scales", "mask=pc.get_mask, shs=shs, scales")
+    given = ("image, radii, depth, used =", f"image, {seen}, radii, used =")
+    reasons = read_plain(fork(taken, given, ('"opacity"]', '"opacity", "mask"]'))).reasons
+    assert ("masks that scale the opacities" in str(reasons)) == bool(reasons) == (seen == "depth")
+
+
+def test_values_that_a_drawing_function_is_given_may_be_those_of_a_ply(fork):
+    given = ("override_color=None):", "override_color=None, dc=None):")
+    joined = "    both = torch.cat([dc, shs], dim=1)\n    drawn"
+    assert read_plain(fork(given, (END, GSPLAT.format("both").replace("    drawn", joined))))
+
+
 def test_positions_that_stand_still_are_no_others(fork):
     stands = "        self._xyz = nn.Parameter(points.requires_grad_(False))\n"
     trained = ("{'params': [], 'name': 'f_dc'}", "{'params': [self._opacity]}")
@@ -404,8 +423,13 @@ def test_what_is_never_saved_is_not_plain(fork, tmp_path):
     ("drawn", "kind", "reason"),
     [("pc.get_xyz", "finetune", ""), ("pc.net(t)", "never", "render makes means3D from pc.net")],
 )
-@pytest.mark.parametrize("setup", ["training_setup", "by_another_name"])
-def test_model_and_drawing_are_found_in_any_package(fork, tmp_path, drawn, kind, reason, setup):
+@pytest.mark.parametrize(
+    ("setup", "name"),
+    [("training_setup", "train"), ("by_another_name", "train"), ("training_setup", "slam")],
+)
+def test_model_and_drawing_are_found_in_any_package(
+    fork, tmp_path, drawn, kind, reason, setup, name
+):
     fork(("means3D = pc.get_xyz", f"means3D = {drawn}"), ("def training_setup(", f"def {setup}("))
     package = tmp_path / "splats/parts"
     package.mkdir(parents=True)
@@ -415,7 +439,8 @@ def test_model_and_drawing_are_found_in_any_package(fork, tmp_path, drawn, kind,
     (package / "unused.py").write_text(RENDER.replace("pc.get_xyz", "pc.other(t)"))
     script = tmp_path / "train.py"
     trains = script.read_text().replace("from gaussian_renderer", "from splats.parts.draw")
-    script.write_text(f"import splats.parts.model\n{trains}")
+    script.unlink()
+    (tmp_path / f"{name}.py").write_text(f"import splats.parts.model\n{trains}")
     verdict = judged(HostRepo(tmp_path))
     assert verdict.kind == kind
     assert reason in verdict.reason
@@ -519,7 +544,8 @@ def test_a_script_that_trains_another_model_fits_nothing(tmp_path):
     skeleton(tmp_path)
     script = tmp_path / "train.py"
     text = script.read_text()
-    script.write_text(f"{text}\nmodel = GaussianModel(3)\nmodel = DeformModel(3)\n")
+    steps = "model = GaussianModel(3)\nmodel.update_learning_rate(1)\n"
+    script.write_text(f"{text}\n{steps}model = DeformModel(3)\n")
     assert judged(HostRepo(tmp_path)).kind == "fits"
     for other in "MeshModel", "GaussianModelDyn":
         script.write_text(f"{text}\nfrom mesh import {other}\nmodel = {other}(3)\n")

@@ -34,7 +34,7 @@ def check(*, hosts: tuple[Path, ...], adapter: str | None) -> Report:
                 "a host's checkout, or the import name of an installed host",
                 "Name the folder of train.py.",
             )
-        if (host / ARGUMENTS).is_file():
+        if (host / ARGUMENTS).is_file() and not any(host.glob("*.py")):
             raise UnknownHostError(
                 str(host),
                 "the output folder of a training",
