@@ -59,17 +59,18 @@ def test_joint_learning_begins_when_densification_is_over(photographs, tmp_path)
     assert sidecar.load(summary.model_after)[0].steps == 5
 
 
-def test_a_training_that_densifies_to_its_end_is_refused(photographs, tmp_path):
-    words = command(HOST / "train.py", photographs, tmp_path / "out", 18)
-    with pytest.raises(
-        UsageError, match=r"iterations after 18, where densification ends.*or lower --from-iter"
-    ):
-        run(words, RunOptions(stage="joint", device="cpu"))
+@pytest.mark.parametrize(
+    ("name", "last", "says"),
+    [
+        ("vanilla-3dgs", 18, r"after 18, where densification ends.*or lower --from-iter"),
+        ("compact-3dgs", 24, r"does not tell when.*Add --from-iter"),
+    ],
+)
+def test_where_joint_learning_cannot_begin_is_refused(name, last, says, photographs, tmp_path):
+    script = written(HOSTS[name], tmp_path / "host") / "train.py"
+    with pytest.raises(UsageError, match=says):
+        run(
+            command(script, photographs, tmp_path / "out", last),
+            RunOptions(stage="joint", device="cpu"),
+        )
     assert not (tmp_path / "out").exists()
-
-
-def test_a_host_that_does_not_tell_is_asked_for_the_iteration(photographs, tmp_path):
-    root = written(HOSTS["compact-3dgs"], tmp_path / "host")
-    words = command(root / "train.py", photographs, tmp_path / "out", 24)
-    with pytest.raises(UsageError, match=r"does not tell when.*Add --from-iter"):
-        run(words, RunOptions(stage="joint", device="cpu"))

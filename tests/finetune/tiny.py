@@ -43,6 +43,19 @@ def random_model(count: int = 60, degree: int = 1, seed: int = 0) -> Model:
     )
 
 
+def round_ones(xyz: torch.Tensor, size: float, opacity: float = 0.95) -> Model:
+    """Grey Gaussians at (N, 3) places, of one size and opacity."""
+    count = len(xyz)
+    return Model(
+        xyz=xyz.float(),
+        f_dc=torch.zeros(count, 1, 3),
+        f_rest=torch.zeros(count, 0, 3),
+        opacity=torch.full((count, 1), opacity).logit(),
+        scaling=torch.full((count, 3), math.log(size)),
+        rotation=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+    )
+
+
 NAMES = [f"view{i:02d}" for i in range(9)]
 """Of the photographs that are written."""
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from finetune import tiny
 
-from fragprune_plugins import Model, RasterInputs, look_at
+from fragprune_plugins import RasterInputs, look_at
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.workbench.figures.extents import CUTS, SQRT8, VIEWERS, Extent, Viewer, shaded
 
@@ -15,14 +15,7 @@ BY_NAME = {viewer.names.split(",")[0]: viewer for viewer in VIEWERS}
 
 def one(opacity=0.5, size=0.2):
     """A round Gaussian in the middle of the picture, and its variance there, pixels^2."""
-    splat = Model(
-        xyz=torch.zeros(1, 3),
-        f_dc=torch.zeros(1, 1, 3),
-        f_rest=torch.zeros(1, 0, 3),
-        opacity=torch.tensor([[opacity]]).logit(),
-        scaling=torch.full((1, 3), math.log(size)),
-        rotation=torch.tensor([[1.0, 0, 0, 0]]),
-    )
+    splat = tiny.round_ones(torch.zeros(1, 3), size, opacity)
     view = look_at((0, 0, -4), (0, 0, 0), width=160, height=160, fov_y=53.13)
     focal = 160 / (2 * view.tan_fov_y)
     return RasterInputs(view, splat.splats()), (focal * size / 4) ** 2 + 0.3

@@ -4,23 +4,12 @@ import math
 
 import pytest
 import torch
+from finetune import tiny
 
 from fragprune_plugins import Model, engine_for
 from fragprune_plugins.workbench.audit.placing import place
 
 ENGINE = engine_for("auto", "cpu")
-
-
-def splat(xyz, size, opacity=0.95):
-    count = len(xyz)
-    return Model(
-        xyz=xyz.float(),
-        f_dc=torch.zeros(count, 1, 3),
-        f_rest=torch.zeros(count, 0, 3),
-        opacity=torch.full((count, 1), opacity).logit(),
-        scaling=torch.full((count, 3), math.log(size)),
-        rotation=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
-    )
 
 
 def box(count, half, seed=0):
@@ -35,7 +24,7 @@ def box(count, half, seed=0):
 def room(seed=0):
     """Walls, a ceiling, a floor, and a table in a corner."""
     table = box(400, (0.6, 0.4, 0.6), seed) + torch.tensor([1.5, 1.0, -1.0])
-    return splat(torch.cat([box(4000, (3.0, 1.5, 2.5), seed), table]), 0.12)
+    return tiny.round_ones(torch.cat([box(4000, (3.0, 1.5, 2.5), seed), table]), 0.12)
 
 
 def thing(seed=0):
@@ -46,7 +35,7 @@ def thing(seed=0):
     turn, reach = 2 * math.pi * torch.rand(1500, generator=stream), 2.0
     radius = reach * torch.rand(1500, generator=stream).sqrt()
     plate = torch.stack([radius * turn.cos(), torch.full((1500,), 1.0), radius * turn.sin()], 1)
-    return splat(torch.cat([body, plate]), 0.1)
+    return tiny.round_ones(torch.cat([body, plate]), 0.1)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -65,7 +54,7 @@ def test_what_is_shown_first_is_the_front_and_from_above(side):
     """A board, painted on one side and plain on the other; y is down."""
     across = torch.linspace(-1, 1, 40)
     board = torch.cartesian_prod(torch.tensor([-0.3, 0.3]), across, across)
-    model = splat(board, 0.04)
+    model = tiny.round_ones(board, 0.04)
     squares = ((board[:, 1:] * 4).floor().sum(dim=1) % 2)[:, None, None].expand(-1, 1, 3)
     model.f_dc[:] = torch.where(board[:, :1, None] * side > 0, 3 * squares - 1.5, 0.0)
     views = [view for _, view in place(model, 12, ENGINE, side="orbit", divide=10).views]
@@ -95,7 +84,9 @@ def test_nobody_looks_out_of_the_open_side():
 def test_thin_haze_all_around_is_no_air():
     """Large faint Gaussians before every wall: no place is open, so cameras stay outside."""
     walls = room()
-    haze = splat(0.2 * torch.randn(60, 3, generator=torch.Generator().manual_seed(1)), 1.0, 0.3)
+    haze = tiny.round_ones(
+        0.2 * torch.randn(60, 3, generator=torch.Generator().manual_seed(1)), 1.0, 0.3
+    )
     both = {name: torch.cat([each, haze.tensors[name]]) for name, each in walls.tensors.items()}
     model = Model(**both)
     assert place(model, 4, ENGINE).enclosed < place(walls, 4, ENGINE).enclosed
