@@ -7,6 +7,7 @@ import signal
 import pytest
 import torch
 from finetune import tiny
+from PIL import Image
 from safetensors.torch import save_file
 
 from fragprune_plugins.errors import CheckpointError, DivergedError, OutputError
@@ -97,6 +98,19 @@ def test_photographs_are_read_once_and_a_changed_one_is_noticed(tmp_path, monkey
     assert len(read) == len(dataset.train) + len(dataset.test)
     read[0].write_bytes(read[0].read_bytes() + b"0")
     assert asked() != first
+
+
+@pytest.mark.parametrize("mode", ["RGBA", "RGB"])
+def test_dropped_alpha_is_noticed_where_there_is_some(tmp_path, mode):
+    data, _, model = tiny.scene(tmp_path)
+    for path in (data / "images").iterdir():
+        with Image.open(path) as picture:
+            picture.convert(mode).save(path)
+    one, other = (
+        resuming.configuration(model, load_dataset(data, opaque=opaque), Settings(), "cpu")
+        for opaque in (True, False)
+    )
+    assert (one != other) == (mode == "RGBA")
 
 
 @pytest.mark.usefixtures("ctrl_c")

@@ -185,6 +185,8 @@ def _of(shot: Shot) -> Iterable[Tensor | str]:
     yield from (shot.view.viewmatrix, shot.view.projmatrix, shot.view.background)
     if isinstance(shot, Photograph):
         yield _content(shot.path)
+        if shot.opaque and shot.transparent:
+            yield "opaque"
         if shot.lens is not None:
             yield repr(shot.lens)
         if shot.mask is not None:
