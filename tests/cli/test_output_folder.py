@@ -120,6 +120,14 @@ def test_images_alpha_counts_as_the_model_shows_it_where_nothing_tells(
     assert run_json("profile", pruned, "--data", data)["psnr"] == pytest.approx(psnr, abs=1)
 
 
+def test_alpha_that_hides_nothing_is_no_news(data, path, tmp_path):
+    for image in (data / "images").iterdir():
+        with Image.open(image) as picture:
+            picture.convert("RGBA").save(image)
+    result = run("finetune", path, "--data", data, "--out", tmp_path / "r.ply", "--iters", 2)
+    assert "alpha" not in result.stderr
+
+
 def test_an_orbit_is_one_also_where_the_trainings_cameras_are_known(output):
     for words in (("profile", output), ("compare", output, output)):
         for option, views in (("--orbit", 12), ("--self", 2)):

@@ -32,7 +32,8 @@ def matched(model: Model, read: Photographs, engine: Engine) -> tuple[Photograph
         return read, ways[told]
     figures = {way: shown(model, each, engine) for way, each in ways.items()}
     best, *others = sorted(figures, key=figures.__getitem__, reverse=True)
-    if best != (read.centred, read.opaque):
+    unknown = len(points) > 1 and read.centred is None
+    if unknown or best != told:
         where = "the middle" if best[0] else "the scene's principal point"
         drawn = [f"is drawn around {where}"] * (len(points) > 1)
         drawn += [f"{'ignores' if best[1] else 'keeps'} the images' alpha"] * (len(alphas) > 1)
