@@ -222,7 +222,7 @@ def _opened(engine: EngineOptions) -> tuple[Engine, torch.device]:
 
 
 def _settled(read: records.Recorded, engine: EngineOptions) -> records.Recorded:
-    """The same, with the principal point by which its first model shows its photographs.
+    """The same, with photographs around the point, and of the alpha, that its first model shows.
 
     A host whose code does not always take the middle may read another by an option alone.
     """
