@@ -134,6 +134,12 @@ def test_a_struct_has_no_fields_that_c_does_not_know():
         binding.Inputs(width=3, gamma=2.2)
 
 
+def test_a_number_in_a_tensor_stays_a_number():
+    given = binding.Inputs(near=torch.tensor(0.25), count=torch.tensor(7), means=torch.ones(1, 3))
+    assert (given.near, given.count) == (0.25, 7)
+    assert given.means
+
+
 def draw(library: binding.Library, inputs: binding.Inputs) -> tuple[int, str]:
     """Status and message of a forward pass."""
     image, radii = torch.empty(3, inputs.height, inputs.width), torch.empty(N, dtype=torch.int32)

@@ -41,14 +41,16 @@ class Error(ctypes.Structure):
 class Named(ctypes.Structure):
     """A struct built from keyword arguments; fields that are not given are zero.
 
-    Tensors are given by their ``address``. Whoever makes the struct keeps them.
+    Where a field is an address, tensors are given. Whoever makes the struct keeps them.
     """
 
     def __init__(self, **fields: Any) -> None:
-        unknown = fields.keys() - {name for name, *_ in self._fields_}
+        places = {name: kind == [_POINTER] for name, *kind in self._fields_}
+        unknown = fields.keys() - places.keys()
         if unknown:  # ctypes itself would set attributes that C never sees
             raise TypeError(f"{type(self).__name__} has no {', '.join(sorted(unknown))}")
-        super().__init__(**{name: address(each) for name, each in fields.items()})
+        given = {name: address(each) if places[name] else each for name, each in fields.items()}
+        super().__init__(**given)
 
 
 def address(value: Any) -> Any:
