@@ -215,17 +215,23 @@ _OWN = ("arguments", "gaussian_renderer", "scene", "utils")
 
 
 def _broken(repo: HostRepo, module: str) -> Iterator[str]:
-    """Modules that a script cannot import; a script in a folder may have others beside it."""
-    own = [each for each in _OWN if (repo.root / each).is_dir()] if "." not in module else []
-    for name, tree in reached(repo, [module]).items():
-        for node in (each for each in tree.body if isinstance(each, ast.Import | ast.ImportFrom)):
+    """Modules that a script cannot import, though it does at once, not only where they are there.
+
+    A script in a folder may have others beside it.
+    """
+    alone, waiting = "." not in module, [module]
+    own = ["train", *(each for each in _OWN if (repo.root / each).is_dir())] if alone else []
+    for name in waiting:  # it grows
+        body = getattr(repo.tree(name), "body", ())
+        for node in (each for each in body if isinstance(each, ast.Import | ast.ImportFrom)):
             at, names = repo.at(name, node.lineno), repo.imported_by(name, node)
             for each in (each for each in names if repo.path(each) and repo.tree(each) is None):
                 yield f"imports {each}, which is no valid Python ({at})"
             top, path = names[0].split(".")[0], names[0].replace(".", "/")
             there = (repo.root / path).is_dir() or any(repo.root.glob(f"{path}.*"))
-            if top in (*own, "train") and not there:
+            if top in own and not there:
                 yield f"imports {names[0]}, which is not there ({at})"
+            waiting += [each for each in names if each not in waiting]
 
 
 def learning(tree: ast.AST | None) -> list[ast.FunctionDef]:
@@ -264,8 +270,10 @@ def _drawn_elsewhere(repo: HostRepo, module: str) -> Iterator[str]:
             gone = skipped(body, known)
             for made in (each for each in every(body, ast.Return) if each not in gone):
                 name = getattr(getattr(made.value, "func", None), "id", "")
-                other = repo.function(usual, name)
-                if other and entries(other, "render") and "GaussianRasteriz" not in text_of(other):
+                other, given = repo.function(usual, name), repo.parameters(usual, name) or ()
+                shown = [text_of(each).split(".clamp(")[0] for each in entries(other, "render")]
+                alone = "GaussianRasteriz" not in text_of(other)
+                if alone and any(each not in given for each in shown):  # or it was drawn before
                     yield f"{name}, which calls no rasterizer of 3DGS"
         for each in node.names if beside.startswith(f"{usual}.") else ():
             home, found = _definition(repo, beside, each.name)
@@ -329,13 +337,17 @@ def _own_folders(repo: HostRepo, module: str) -> Iterator[str]:
     body = getattr(repo.tree(module), "body", ())
     asked = [node for node in body if isinstance(node, ast.If)]
     main = [each for node in asked if "__name__" in text_of(node.test) for each in node.body]
+    known = as_options(repo, ("arguments", module))
     for node in (each for each in (*body, *main) if isinstance(each, ast.Assign)):
         name, at = getattr(node.targets[0], "attr", ""), repo.at(module, node.lineno)
         if name in ("source_path", "model_path") and f".{name}" not in text_of(node.value):
             yield f"sets {name} itself, whatever its command says ({at})"
         called = getattr(getattr(node.value, "func", None), "id", "")
         made = _definition(repo, module, called)[1]
-        if isinstance(made, ast.FunctionDef) and "setattr(" in text_of(made):
+        if not isinstance(made, ast.FunctionDef):
+            continue
+        done = {*every(made, ast.Call)} - skipped(made, known).keys()
+        if any(text_of(each.func) == "setattr" for each in done):
             yield f"sets options by {called}, whatever its command says ({at})"
 
 

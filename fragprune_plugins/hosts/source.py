@@ -143,11 +143,11 @@ class HostRepo:
         return bool(self.package) or lies_in(path, self.root)
 
     def read(self, path: Path) -> str:
-        """The text of a file; "" where it is missing, or leads out of the checkout."""
+        """The text of a file, without a mark of its encoding; "" where it is missing or outside."""
         try:
             if self._inside(path):
                 with _FILE.reading(path) as reading:
-                    return reading.file.read().decode("utf-8", "replace")
+                    return reading.file.read().decode("utf-8-sig", "replace")
         except UnknownHostError:
             pass
         return ""

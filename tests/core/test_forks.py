@@ -617,6 +617,7 @@ OVERRULES = {
     "the same, whole": ("args.source_path = os.path.abspath(args.source_path)", True),
     "another option": ("args.images = 'images_4'", True),
     "options of a file": ("args = overruled(args, read(args.config))", False),
+    "options of a file that is named": ("args = asked(args, read)", True),
     "where none is given": ("if not args.model_path:\n        args.model_path = 'out'", True),
 }
 
@@ -625,6 +626,8 @@ OVERRULES = {
 def test_a_script_that_overrules_the_folders_of_its_command_is_refused(tmp_path, what):
     sets, served = OVERRULES[what]
     rules = "\n\ndef overruled(args, options):\n    setattr(args, *options)\n    return args\n"
+    rules += "\n\nparser.add_argument('--config', default='')\n\n\ndef asked(args, read):\n"
+    rules += "    if args.config:\n        setattr(args, *read(args.config))\n    return args\n"
     main = f"{rules}\nif __name__ == '__main__':\n    {sets}\n{PARSES}"
     found = errors(fork(tmp_path, (PARSES, main)))
     assert found == [] if served else "whatever its command says" in found[0]
@@ -998,6 +1001,7 @@ def test_a_function_without_a_rasterizer_draws_in_the_place_of_no_other(tmp_path
     [
         ("helpers", "def f():\n", "imports helpers, which is no valid Python (scene/tools.py:1)"),
         ("helpers", "def f(): ...\n", ""),
+        ("helpers", "\ufeffdef f(): ...\n", ""),
         ("helpers", None, ""),  # an installed package
         ("train", None, "imports train, which is not there (scene/tools.py:1)"),
         ("scene.helpers", None, "imports scene.helpers, which is not there (scene/tools.py:1)"),
@@ -1011,6 +1015,32 @@ def test_a_script_that_cannot_import_its_own_modules_is_refused(tmp_path, name, 
         (tmp_path / f"{name}.py").write_text(text)
     found = "; ".join(errors(repo))
     assert (f"train_scene.py: {said}" in found) if said else not found
+
+
+@pytest.mark.parametrize("optional", ["try:", "def later():"])
+def test_a_module_that_is_imported_only_where_it_is_there_may_be_broken(tmp_path, optional):
+    imports = f"{optional}\n    import scene.viewer\n"
+    imports += "except ImportError: ...\n" if optional == "try:" else ""
+    repo = fork(tmp_path, ("from scene import", f"{imports}from scene import"))
+    (tmp_path / "scene/viewer.py").write_text("from scene.gone import f\n")
+    assert errors(repo) == []
+
+
+def test_a_script_in_a_folder_imports_what_lies_beside_it(tmp_path):
+    repo = fork(tmp_path, ("from scene", "from train import f\nfrom scene"), script="train_a.py")
+    (tmp_path / "apps").mkdir()
+    (tmp_path / "train_a.py").rename(tmp_path / "apps/train_a.py")
+    (tmp_path / "apps/train.py").write_text("def f(): ...\n")
+    assert not any("which is not there" in each for each in errors(repo))
+
+
+def test_a_function_that_hands_a_picture_on_draws_none(tmp_path):
+    keys = 'return {"render": image, "radii": radii}', "return packed(image, radii)"
+    repo = fork(tmp_path, keys)
+    renderer = tmp_path / "gaussian_renderer/__init__.py"
+    packs = "def packed(image, radii):\n    return {'render': image, 'radii': radii}\n"
+    renderer.write_text(renderer.read_text() + packs)
+    assert not any("which calls no rasterizer of 3DGS" in each for each in errors(repo))
 
 
 def test_a_second_draw_of_some_rows_alone_is_refused(tmp_path):
