@@ -231,7 +231,7 @@ def _broken(repo: HostRepo, module: str) -> Iterator[str]:
             there = (repo.root / path).is_dir() or any(repo.root.glob(f"{path}.*"))
             if top in own and not there:
                 yield f"imports {names[0]}, which is not there ({at})"
-            waiting += [each for each in names if each not in waiting]
+            waiting += [each for each in names if each not in waiting and repo.holds(each)]
 
 
 def learning(tree: ast.AST | None) -> list[ast.FunctionDef]:
@@ -639,7 +639,7 @@ def reached(repo: HostRepo, modules: Iterable[str], without: str = "") -> dict[s
         seen[module] = tree
         for node in nodes(tree):
             if isinstance(node, ast.Import | ast.ImportFrom):
-                waiting += repo.imported_by(module, node)
+                waiting += filter(repo.holds, repo.imported_by(module, node))
     return seen
 
 

@@ -124,4 +124,13 @@ def test_an_installed_host_is_not_read_with_all_that_is_installed_beside_it(monk
     """Its imports lead to torch: 12 GB of syntax trees."""
     monkeypatch.setattr(reading_of_photographs, "unlike", None)
     adapter = GaussianSplatting()
-    assert adapter.not_drawn(HostRepo.installed(adapter.installed[0]), []) == []
+    repo = HostRepo.installed(adapter.installed[0])
+    assert adapter.not_drawn(repo, []) == []
+    read = HostRepo.tree
+
+    def tree(repo, module):
+        assert not module.startswith("torch"), module
+        return read(repo, module)
+
+    monkeypatch.setattr(HostRepo, "tree", tree)
+    adapter.fingerprint(repo)
