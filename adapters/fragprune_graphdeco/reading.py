@@ -224,14 +224,14 @@ def _broken(repo: HostRepo, module: str) -> Iterator[str]:
     for name in waiting:  # it grows
         body = getattr(repo.tree(name), "body", ())
         for node in (each for each in body if isinstance(each, ast.Import | ast.ImportFrom)):
-            at, names = repo.at(name, node.lineno), repo.imported_by(name, node)
+            at, names = repo.at(name, node.lineno), _own_imports(repo, name, node)
             for each in (each for each in names if repo.path(each) and repo.tree(each) is None):
                 yield f"imports {each}, which is no valid Python ({at})"
-            top, path = names[0].split(".")[0], names[0].replace(".", "/")
-            there = (repo.root / path).is_dir() or any(repo.root.glob(f"{path}.*"))
-            if top in own and not there:
-                yield f"imports {names[0]}, which is not there ({at})"
-            waiting += [each for each in names if each not in waiting and repo.holds(each)]
+            for each in (each for each in names[:1] if each.split(".")[0] in own):
+                path = each.replace(".", "/")
+                if not ((repo.root / path).is_dir() or any(repo.root.glob(f"{path}.*"))):
+                    yield f"imports {each}, which is not there ({at})"
+            waiting += [each for each in names if each not in waiting]
 
 
 def learning(tree: ast.AST | None) -> list[ast.FunctionDef]:
@@ -639,8 +639,14 @@ def reached(repo: HostRepo, modules: Iterable[str], without: str = "") -> dict[s
         seen[module] = tree
         for node in nodes(tree):
             if isinstance(node, ast.Import | ast.ImportFrom):
-                waiting += filter(repo.holds, repo.imported_by(module, node))
+                waiting += _own_imports(repo, module, node)
     return seen
+
+
+def _own_imports(repo: HostRepo, module: str, node: ast.Import | ast.ImportFrom) -> list[str]:
+    """What a statement may import of the host: beside an installed one lie all other packages."""
+    names = repo.imported_by(module, node)
+    return [each for each in names if repo.package in ("", each.split(".")[0])]
 
 
 def defaults(repo: HostRepo, module: str, name: str) -> list[ast.expr]:

@@ -212,10 +212,6 @@ class HostRepo:
         base = self.absolute(module, node)
         return [base, *(f"{base}.{alias.name}" for alias in node.names)]
 
-    def holds(self, module: str) -> bool:
-        """Whether a module may be this host's: beside an installed one lie all other packages."""
-        return self.package in ("", module.split(".")[0])
-
     def mentions(self, modules: Iterable[str], names: Iterable[str]) -> dict[str, str]:
         """Which of the names occur as identifiers, attributes or parameters, and where."""
         wanted = set(names)
