@@ -250,11 +250,9 @@ class _Project:
         at = path.relative_to(self.repo.root).as_posix()
         if path in self.texts:
             at += f":{self.texts[path].count(chr(10), 0, position) + 1}"
-        where, remedy = (
-            f"{self.package} ({at})",
-            "Its pictures are not ours, so no adapter draws them.",
-        )
+        where = f"{self.package} ({at})"
         if error:
+            remedy = "Its pictures are not ours, so no adapter draws them."
             return Finding.error("kernel", where, found, expected, remedy)
         remedy = "It was not read any further; compare pictures on the first run."
         return Finding("warning", "kernel", where, found, expected, remedy)

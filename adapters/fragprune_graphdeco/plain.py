@@ -142,10 +142,8 @@ def _saving(repo: HostRepo, modules: Iterable[str], *methods: str) -> Iterator[M
         body = getattr(repo.tree(module), "body", ())
         classes = [each for each in body if isinstance(each, ast.ClassDef)]
         for each in sorted(classes, key=lambda each: each.name != "GaussianModel"):
-            own, model = (
-                {getattr(n, "name", "") for n in each.body},
-                ModelClass(repo, module, each.name),
-            )
+            own = {getattr(node, "name", "") for node in each.body}
+            model = ModelClass(repo, module, each.name)
             if own.issuperset(methods) and _columns(model)[1]:
                 yield model
 

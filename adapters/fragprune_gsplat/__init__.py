@@ -160,11 +160,14 @@ class Gsplat(HostAdapter):
         Seam(Role.STILL, DEFAULT, "DefaultStrategy.step_post_backward", ("params",)),
         Seam(Role.STILL, MCMC, "MCMCStrategy.step_post_backward", ("params",)),
         answered(
-            *("relocation", "compute_relocation", "opacities", "scales", "ratios", "binoms"),
+            "relocation",
+            "compute_relocation",
+            *("opacities", "scales", "ratios", "binoms"),
             by="relocation",
         ),
         answered(
-            *("cuda._wrapper", "quat_scale_to_covar_preci"),
+            "cuda._wrapper",
+            "quat_scale_to_covar_preci",
             *("quats", "scales", "compute_covar", "compute_preci", "triu"),
             by="covariance",
         ),

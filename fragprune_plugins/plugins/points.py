@@ -36,8 +36,7 @@ def load(point: EntryPoint, kind: type | tuple[type, ...] = object) -> Any:
         if not isinstance(loaded, kind):
             raise TypeError(f"{point.value} is a {type(loaded).__name__}")
     except (Exception, SystemExit) as error:
-        found = f"{type(error).__name__}: {error}".split("\n", 1)[0]
-        found = printable(found)
+        found = printable(f"{type(error).__name__}: {error}".split("\n", 1)[0])
         expected = f"an object that {owner} offers"
         remedy = f"Update or uninstall {owner}."
         raise PluginError(f"{point.group} {point.name}", found, expected, remedy) from error

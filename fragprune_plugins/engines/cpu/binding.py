@@ -46,11 +46,9 @@ class Named(ctypes.Structure):
 
     def __init__(self, **fields: Any) -> None:
         places = {name: kind == [_POINTER] for name, *kind in self._fields_}
-        unknown = fields.keys() - places.keys()
-        if unknown:  # ctypes itself would set attributes that C never sees
+        if unknown := fields.keys() - places.keys():  # ctypes would set what C never sees
             raise TypeError(f"{type(self).__name__} has no {', '.join(sorted(unknown))}")
-        given = {name: address(each) if places[name] else each for name, each in fields.items()}
-        super().__init__(**given)
+        super().__init__(**{k: address(v) if places[k] else v for k, v in fields.items()})
 
 
 def address(value: Any) -> Any:
