@@ -71,7 +71,7 @@ def read_ply(path: Path, *, filtered: bool = False) -> Model:
         ModelFileError: missing, truncated, not a PLY, not a Gaussian splat, empty or not finite.
     """
     path = Path(path)
-    if path.suffix == ".pth":
+    if path.suffix in (".pth", ".pt", ".ckpt"):
         found = "a training codebase's checkpoint, which only that codebase can draw"
         remedy = "Pass its PLY. Fine-tune and draw a host without PLYs (4D models) through its own "
         remedy += "script, with fragprune run."

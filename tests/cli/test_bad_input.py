@@ -45,6 +45,7 @@ def untouched(out):
 WRONG = {
     "model cut off": ("model-file", "not readable as PLY"),
     "a checkpoint": ("model-file", "(4D models)"),
+    "gsplat's checkpoint": ("model-file", "(4D models)"),
     "data missing": ("dataset", "no such folder"),
     "stale sidecar": ("sidecar", "thresholds of another model"),
 }
@@ -64,6 +65,8 @@ def test_refused(data, path, out, tmp_path, command, how):
         path.write_bytes(path.read_bytes()[:-50])
     elif how == "a checkpoint":
         path = path.rename(path.with_name("chkpnt30.pth"))
+    elif how == "gsplat's checkpoint":
+        path = path.rename(path.with_name("ckpt_29_rank0.pt"))
     elif how == "data missing":
         data = tmp_path / "nowhere"
     else:

@@ -262,7 +262,7 @@ def test_what_does_not_learn_stays_as_it_is_to_the_bit(run, methods, scene, tmp_
     [
         (STAGE2, {}, "--max-num-iterations"),
         (50, {"fragprune_from": 50}, "--max-num-iterations"),
-        (50, {"fragprune": Learning(goal="faster=1.5")}, "fewer fragments"),
+        (50, {"fragprune": Learning(goal="faster=1.5")}, "pressure, fewer, portable"),
     ],
 )
 def test_a_training_that_learns_nothing_is_refused(methods, scene, tmp_path, length, model, remedy):
