@@ -481,7 +481,7 @@ def test_from_a_command_for_splatfacto_to_a_model_that_fragprune_reads(scene, tm
     assert len(drawn) == len(seen) > 0
     for ours, both in zip(drawn, seen, strict=True):  # ns-eval's: the photograph, and the picture
         assert np.array_equal(ours, both[:, -ours.shape[1] :])
-    assert "learned thresholds" in command(
+    assert "with cutoffs" in command(
         "fragprune", "profile", tmp_path / "splat.ply", "--data", scene
     )
     script = ["-m", "nerfstudio.scripts.exporter", "gaussian-splat", "--load-config", config]
@@ -498,8 +498,8 @@ from fragprune_plugins.injection import stepping
 
 report = stepping.report
 
-def interrupting(session, stats):
-    report(session, stats)
+def interrupting(session, state, stats):
+    report(session, state, stats)
     if stats.step == 4:
         signal.raise_signal(signal.SIGINT)
 
