@@ -147,7 +147,7 @@ class HostRepo:
         try:
             if self._inside(path):
                 with _FILE.reading(path) as reading:
-                    return reading.file.read().decode("utf-8-sig", "replace")
+                    return reading.file.read().decode("utf-8", "replace").removeprefix("\ufeff")
         except UnknownHostError:
             pass
         return ""
