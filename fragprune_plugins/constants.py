@@ -3,7 +3,6 @@
 The native headers hold the same numbers (``native/include/fragprune.h``); a test compares the two.
 """
 
-import logging
 from typing import Final
 
 ALPHA_MIN: Final = 1.0 / 255.0
@@ -72,6 +71,3 @@ on it would round to 1."""
 
 VERSION: Final = "0.1.0"
 """Of the package; pyproject.toml has the same."""
-
-log: Final = logging.getLogger("fragprune")
-"""Where every module tells what it does."""

@@ -1,9 +1,13 @@
-"""Every error a user can meet: where, what was found, what was expected, what to do."""
+"""The log, and every error a user can meet: where, what was found, expected, what to do."""
 
 from __future__ import annotations
 
+import logging
 import re
-from typing import ClassVar
+from typing import ClassVar, Final
+
+log: Final = logging.getLogger("fragprune")
+"""Where every module tells what is no error."""
 
 
 def printable(text: str) -> str:

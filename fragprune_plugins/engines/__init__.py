@@ -5,8 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Protocol
 
-from fragprune_plugins.constants import log
-from fragprune_plugins.errors import EngineError, UsageError
+from fragprune_plugins.errors import EngineError, UsageError, log
 
 if TYPE_CHECKING:
     import torch

@@ -16,8 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fragprune_plugins.constants import log
-from fragprune_plugins.errors import ModelFileError
+from fragprune_plugins.errors import ModelFileError, log
 from fragprune_plugins.files.columns import change_of, is_plain
 from fragprune_plugins.files.model import REST_COUNTS, Model
 from fragprune_plugins.files.ply_table import HEADER_MAX, Columns, header_lines, read_vertices

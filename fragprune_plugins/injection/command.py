@@ -8,8 +8,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-from fragprune_plugins.constants import log
-from fragprune_plugins.errors import UsageError
+from fragprune_plugins.errors import UsageError, log
 from fragprune_plugins.hosts.adapter import CommandLine, ConfigFile, read_config
 from fragprune_plugins.hosts.source import HostRepo
 

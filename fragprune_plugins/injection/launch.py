@@ -7,8 +7,7 @@ import time
 from functools import partial
 from pathlib import Path
 
-from fragprune_plugins.constants import log
-from fragprune_plugins.errors import UsageError
+from fragprune_plugins.errors import UsageError, log
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.hosts import preflight
 from fragprune_plugins.hosts.adapter import HostAdapter, ScriptAdapter

@@ -17,9 +17,9 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fragprune_plugins.constants import VERSION, log
+from fragprune_plugins.constants import VERSION
 from fragprune_plugins.engines.cuda.kernels import cache_folder, digest_of_sources
-from fragprune_plugins.errors import EngineError, InputError, ProofError
+from fragprune_plugins.errors import EngineError, InputError, ProofError, log
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.hosts.dialect import HostCall, Place, Proof, Prover
 from fragprune_plugins.hosts.seams import SeamCall

@@ -12,9 +12,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fragprune_plugins.constants import NEUTRAL_LOGIT, log
+from fragprune_plugins.constants import NEUTRAL_LOGIT
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.errors import AlignmentError, SessionError, UsageError
+from fragprune_plugins.errors import AlignmentError, SessionError, UsageError, log
 from fragprune_plugins.hosts.dialect import HostCall
 from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
 from fragprune_plugins.injection.proofs import proved

@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fragprune_plugins.constants import log
 from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.engines.losses import compiled_loss
+from fragprune_plugins.errors import log
 from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.state import SessionState

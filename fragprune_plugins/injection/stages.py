@@ -18,7 +18,6 @@ from typing import Any
 
 from torch import Tensor
 
-from fragprune_plugins.constants import log
 from fragprune_plugins.errors import (
     HostFailed,
     Interrupted,
@@ -26,6 +25,7 @@ from fragprune_plugins.errors import (
     SidecarError,
     Terminated,
     UsageError,
+    log,
 )
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.hosts.adapter import ScriptAdapter

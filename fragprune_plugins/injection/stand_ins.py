@@ -12,8 +12,7 @@ from typing import Any
 
 import torch
 
-from fragprune_plugins.constants import log
-from fragprune_plugins.errors import LateImportError
+from fragprune_plugins.errors import LateImportError, log
 from fragprune_plugins.hosts.dialect import Dialect, HostCall
 from fragprune_plugins.hosts.preflight import present
 

@@ -12,8 +12,7 @@ import torch
 from plyfile import PlyData
 from torch import Tensor
 
-from fragprune_plugins.constants import log
-from fragprune_plugins.errors import ModelFileError, UsageError
+from fragprune_plugins.errors import ModelFileError, UsageError, log
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.ply import read_thresholds

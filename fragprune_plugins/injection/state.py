@@ -18,9 +18,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fragprune_plugins.constants import log
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.errors import AlignmentError, SessionError
+from fragprune_plugins.errors import AlignmentError, SessionError, log
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.hosts.adapter import HostAdapter
 from fragprune_plugins.hosts.dialect import Proof

@@ -29,8 +29,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from fragprune_plugins.constants import log
-from fragprune_plugins.errors import DivergedError, ResetError
+from fragprune_plugins.errors import DivergedError, ResetError, log
 from fragprune_plugins.learning.events import Progress, StepStats
 from fragprune_plugins.learning.finite import are_finite, expect_finite, not_finite
 from fragprune_plugins.learning.plain import numbers_of, put

@@ -20,8 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import pluggy
 
-from fragprune_plugins.constants import log
-from fragprune_plugins.errors import PluginError
+from fragprune_plugins.errors import PluginError, log
 from fragprune_plugins.hosts.adapter import HostAdapter, HostInfo
 from fragprune_plugins.hosts.findings import Finding
 from fragprune_plugins.plugins import hookspecs

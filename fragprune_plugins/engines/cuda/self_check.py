@@ -19,8 +19,8 @@ from typing import Final, Literal
 
 import torch
 
-from fragprune_plugins.constants import log
 from fragprune_plugins.engines.cuda import driver, kernels
+from fragprune_plugins.errors import log
 
 PATIENCE: Final = 300
 """Seconds that a check may take; mostly for compiling, once."""

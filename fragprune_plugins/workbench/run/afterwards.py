@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 import re
 import subprocess
 import sys
@@ -12,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from fragprune_plugins.errors import DatasetError, HostFailed, UsageError
+from fragprune_plugins.errors import DatasetError, HostFailed, UsageError, log
 from fragprune_plugins.hosts.adapter import Flags
 from fragprune_plugins.hosts.choosing import attempt, folder_above
 from fragprune_plugins.hosts.photographs import Photographs
@@ -29,8 +28,6 @@ from fragprune_plugins.workbench.saved import models_of
 from fragprune_plugins.workbench.scenes.dataset import read_scene
 from fragprune_plugins.workbench.scenes.output import cameras_of, told_by, trained_on
 from fragprune_plugins.workbench.scenes.training import exposed
-
-log = logging.getLogger("fragprune")
 
 _BY_HAND = "fragprune finetune MODEL.ply --data SCENE --out pruned.ply learns on any that is there."
 

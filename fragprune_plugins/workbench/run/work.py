@@ -25,6 +25,7 @@ from fragprune_plugins.errors import (
     NotComparedError,
     SidecarError,
     UnknownHostError,
+    log,
 )
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.hosts.photographs import Photographs
@@ -47,8 +48,6 @@ from fragprune_plugins.workbench.scenes.dataset import load_photographs
 from fragprune_plugins.workbench.scenes.generated import views_near
 from fragprune_plugins.workbench.scenes.output import saw_all
 from fragprune_plugins.workbench.scenes.training import saw_held_out
-
-log = logging.getLogger("fragprune")
 
 _WHERE = {"joint": "inside the training"}
 _CONTROL = (

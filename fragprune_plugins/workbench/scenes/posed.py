@@ -5,7 +5,6 @@ OpenCV straightens photographs: cameras have lens distortion, rasterization has 
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from fragprune_plugins.errors import DatasetError
+from fragprune_plugins.errors import DatasetError, log
 from fragprune_plugins.workbench.scenes.pinhole import Camera
 
 if TYPE_CHECKING:
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
 
     Pixels = np.ndarray[Any, np.dtype[np.uint8]]
 
-log = logging.getLogger("fragprune")
 
 Item = TypeVar("Item")
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from fragprune_plugins.errors import DatasetError
+from fragprune_plugins.errors import DatasetError, log
 from fragprune_plugins.files.reading import MEBIBYTE, UntrustedFile
 from fragprune_plugins.workbench.scenes.images import find_image, image_size
 from fragprune_plugins.workbench.scenes.pinhole import focal
@@ -21,7 +20,6 @@ _PINHOLES = ("", "PINHOLE", "SIMPLE_PINHOLE")
 _BENT = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE")
 _FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
-log = logging.getLogger("fragprune")
 
 JSON_MAX = 32 * MEBIBYTE
 """Ten thousand frames of nerfstudio take 11 to 13 MiB, of a ``cameras.json`` 4."""

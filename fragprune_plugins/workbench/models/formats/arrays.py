@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import replace
 from typing import Any
 
@@ -25,8 +24,6 @@ SH_C0 = 0.28209479177387814
 """The SH basis function of degree 0: a colour is 0.5 + SH_C0 f_dc."""
 
 _ALPHA_EDGE = 1e-6  # an 8-bit opacity of 0 or 255 has no finite logit
-
-log = logging.getLogger("fragprune")
 
 
 def splat_of(

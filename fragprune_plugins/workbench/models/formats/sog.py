@@ -20,7 +20,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from fragprune_plugins.constants import VERSION
-from fragprune_plugins.errors import ModelFileError
+from fragprune_plugins.errors import ModelFileError, log
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.reading import MEBIBYTE, Reading, UntrustedFile, parse_json
 from fragprune_plugins.workbench.models.formats import Format, arrays
@@ -87,7 +87,7 @@ def _read(meta: dict[str, Any], load: Load) -> Model:
         raise ValueError(f"{count!r} Gaussians")
     arrays.expect_plausible(count, len(load(meta["means"]["files"][0])))
     if (kind := meta.get("model", "default")) != "default":
-        arrays.log.warning("SOG: its training model is %.40r, and is drawn as 3DGS draws", kind)
+        log.warning("SOG: its training model is %.40r, and is drawn as 3DGS draws", kind)
 
     def image(part: dict[str, Any], index: int = 0) -> arrays.Bytes:
         return _pixels(load(part["files"][index]), count).reshape(-1, 4)[:count]

@@ -17,6 +17,7 @@ from typing import Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
+from fragprune_plugins.errors import log
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.reading import Reading
 from fragprune_plugins.workbench.models.formats import Format, arrays
@@ -74,12 +75,10 @@ def read(reading: Reading) -> Model:
         records = _records(zone) if header.extended else {}
         parts = _streams(reading, header)
     if header.antialiased:
-        arrays.log.warning(
-            "SPZ: it was trained with antialiasing, and is drawn as 3DGS draws, without"
-        )
+        log.warning("SPZ: it was trained with antialiasing, and is drawn as 3DGS draws, without")
     if unknown := records.keys() - {CUTOFFS, STOP, SOFT, _COORDINATES}:
         named = ", ".join(f"{each:#010x}" for each in sorted(unknown)[:_NAMED])
-        arrays.log.warning("SPZ: skipped %d extension(s): %s", len(unknown), named)
+        log.warning("SPZ: skipped %d extension(s): %s", len(unknown), named)
     count, codes, stop = header.count, records.get(CUTOFFS), records.get(STOP)
     if codes is not None and len(codes) != count:
         raise ValueError(f"{len(codes)} thresholds for {count} Gaussians")
