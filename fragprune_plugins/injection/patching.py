@@ -86,7 +86,7 @@ class PatchLedger:
             module, seam, handle = self._wrapped.pop()
             try:
                 wrapt.unwrap_object(module, seam.attribute, handle)
-                # Copies by ``from module import name``; of a method there are none.
+                # Copies by ``from module import name``.
                 for other in _holding(seam.attribute, handle).values():
                     setattr(other, seam.attribute, getattr(module, seam.attribute))
             except (wrapt.WrapperNotOutermostError, wrapt.WrapperNotFoundError) as error:
@@ -139,6 +139,6 @@ class PatchLedger:
 
 
 def _holding(name: str, thing: Any) -> dict[str, ModuleType]:
-    """The modules that hold a thing by this name."""
-    loaded = list(sys.modules.items())
+    """The modules that hold a thing by this name: none for a method, which its class holds."""
+    loaded = [] if "." in name else list(sys.modules.items())
     return {key: each for key, each in loaded if getattr(each, "__dict__", {}).get(name) is thing}
