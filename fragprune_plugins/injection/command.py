@@ -107,12 +107,12 @@ def split(command: list[str]) -> tuple[Path, list[str], str]:
     for entry in entry_points(group="console_scripts", name=words[0]) if words else ():
         return _script_of(entry.module), words[1:], entry.module  # as pip installed the command
     if not words or not words[0].endswith(".py"):
-        raise UsageError(
-            "command",
-            repr(" ".join(command)) if command else "none",
-            "-- python train.py ... (a script of the host), or -- python -m package.module ...",
-            "Put the host's own training command after --.",
+        found = repr(" ".join(command)) if command else "none"
+        expected = (
+            "-- python train.py ... (a script of the host), or -- python -m package.module ..."
         )
+        remedy = "Put the host's own training command after --, and what sets variables or starts "
+        raise UsageError("command", found, expected, f"{remedy}programs in front of fragprune.")
     script = Path(words[0]).resolve()
     if not script.is_file():
         raise UsageError(

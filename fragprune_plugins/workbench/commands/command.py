@@ -31,6 +31,8 @@ from fragprune_plugins.workbench.ranks import launched, should_print
 
 JSON = "fragprune.json"
 """Key of a bool in the context's ``meta``: stdout gets only one JSON object."""
+WORDS = "fragprune.words"
+"""Key of the command's words there."""
 
 
 @dataclass(frozen=True)
@@ -66,11 +68,13 @@ class Command(click.Command):
         """Parse the words; with --json among them, a usage error is printed as JSON."""
         words = list(args)
         try:
-            return super().make_context(info_name, args, *more, **extra)
+            context = super().make_context(info_name, args, *more, **extra)
         except click.UsageError as error:
             raise usage_error(error, words) from error
         except FragpruneError as error:  # of a type of an argument
             raise _stated(error, as_json="--json" in _ours(words)) from error
+        context.meta[WORDS] = words
+        return context
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command, print its report or error, and exit with its code."""
@@ -88,6 +92,8 @@ class Command(click.Command):
             ctx.exit(EXIT_CODE if isinstance(error, Terminate) else 130)
         if report is None:
             ctx.exit(0)
+        if isinstance(ctx.obj, list):
+            ctx.obj.append(report)
         click.echo(json.dumps(strict(report.data)) if as_json else printable(report.text))
         ctx.exit(report.exit_code)
 

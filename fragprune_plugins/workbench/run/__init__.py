@@ -68,6 +68,10 @@ def command(**options: Any) -> Report:
     tells), its training runs by itself, and that PLY is then fine-tuned as by fragprune finetune.
     Where that was interrupted, --stage finetune goes on; without it the training runs again.
 
+    The command may be a script that starts trainings, such as full_eval.py or a shell's train.sh:
+    each script of a host that it starts by the word python runs as if fragprune run stood in front
+    of it, with the same options.
+
     \b
     Examples:
       fragprune run -- python train.py -s scene -m out --eval
@@ -75,5 +79,6 @@ def command(**options: Any) -> Report:
       fragprune run --stage finetune -- train.py -s scene -m out     (already trained)
       fragprune run --stage joint -- python train.py -s scene -m out   (no added iterations)
       fragprune run -- python render.py -m out                       (renders with cutoffs)
+      fragprune run -- bash train_all.sh                             (each training in it)
     """
     return work_of(__name__, **options)

@@ -25,6 +25,7 @@ from fragprune_plugins.errors import (
     NotComparedError,
     SidecarError,
     UnknownHostError,
+    UsageError,
     log,
 )
 from fragprune_plugins.files import sidecar
@@ -33,7 +34,7 @@ from fragprune_plugins.injection import launch
 from fragprune_plugins.injection.process import current_gpu
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.types import RasterInputs, RasterOutputs
-from fragprune_plugins.workbench.commands.command import JSON, Report
+from fragprune_plugins.workbench.commands.command import JSON, WORDS, Report
 from fragprune_plugins.workbench.commands.logs import Bar, logging_steps
 from fragprune_plugins.workbench.commands.opening import bound_threads, open_engine
 from fragprune_plugins.workbench.commands.options import EngineOptions
@@ -44,6 +45,7 @@ from fragprune_plugins.workbench.finetune.trial import Trial, tried
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.pruning import kept
 from fragprune_plugins.workbench.run.afterwards import Unserved, train_then_finetune, unserved
+from fragprune_plugins.workbench.run.sweep import is_sweep, run_sweep
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
 from fragprune_plugins.workbench.scenes.generated import views_near
 from fragprune_plugins.workbench.scenes.output import saw_all
@@ -71,6 +73,15 @@ def run(
     """Do what ``fragprune run`` promises; its options are the arguments."""
     bound_threads(engine.threads)
     logging.basicConfig(level=logging.INFO, format="fragprune: %(message)s", stream=sys.stderr)
+    context = click.get_current_context()
+    as_json = context.meta[JSON]
+    if is_sweep(host_command):
+        if context.params["logs"]:
+            what = " ".join(host_command)
+            raise UsageError("--log", what, "one training, whose steps it writes", "Leave it out.")
+        words = context.meta[WORDS]
+        ours = words[: words.index("--") if "--" in words else len(words) - len(host_command)]
+        return run_sweep(host_command, ours, quietly=as_json)
     looking = Looking(engine)
     options = launch.RunOptions(
         adapter=adapter,
@@ -85,7 +96,6 @@ def run(
     )
     before = after = None
     # A host prints to stdout; with --json, stdout gets only our object.
-    as_json = click.get_current_context().meta[JSON]
     with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
         warmup = 0 if stage == "joint" else settings.warmup
         with logging_steps([Bar(settings.iterations, warmup)]):

@@ -1,0 +1,183 @@
+"""A script that starts trainings, such as ``full_eval.py`` or ``train.sh``: each one is served.
+
+It runs by itself, and finds a ``python`` in front of the real one: what a host's script is started
+by runs it as if ``fragprune run`` stood there, with the same options (``started``).
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import json
+import os
+import re
+import shlex
+import shutil
+import signal
+import stat
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock
+
+from fragprune_plugins.errors import HostFailed, UsageError, log
+from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.injection.command import split
+from fragprune_plugins.learning.interruption import Terminate, sigterm_interrupts
+from fragprune_plugins.workbench.commands.command import Report
+from fragprune_plugins.workbench.figures import wording
+
+OPTIONS = "options.json"
+STOPPED = "stopped"
+
+_SHELLS = {"sh", "bash", "zsh", "dash", "ksh"}
+_STARTING = {"system", "popen", "Popen", "run", "call", "check_call", "check_output"}
+_PAST = re.compile(
+    r"\bactivate\b|sys\.executable|\b(conda|mamba|uv|poetry|pipenv) run\b|/python[\d.]*\s+\S+\.py"
+    r"|\b(torchrun|accelerate launch|torch\.distributed)\b"
+)
+"""What starts or finds another ``python`` than the first of the PATH."""
+_SINGLY = "Put fragprune run -- in front of each training."
+
+
+def is_sweep(command: Sequence[str]) -> bool:
+    """Whether a command runs a script that trains nothing itself, but starts others that do.
+
+    Raises:
+        UsageError: it does, in a way in which they cannot be served.
+    """
+    name = Path(command[0]).name if command else ""
+    if name in _SHELLS or name.endswith(".sh"):
+        for script in (Path(word) for word in command if word.endswith(".sh")):
+            if script.is_file():
+                text = script.read_text(encoding="utf-8", errors="replace")
+                _expect_seen(script, [each.partition("#")[0] for each in text.splitlines()])
+        return True
+    try:
+        script, _, _ = split(list(command))
+    except UsageError:  # told where the command is run
+        return False
+    started = _started_by(HostRepo(script.parent), script)
+    _expect_seen(script, started)
+    return bool(started)
+
+
+def _expect_seen(script: Path, lines: Sequence[str]) -> None:
+    """Refuse a script that would not find our ``python``."""
+    for line in lines:
+        if _PAST.search(line):
+            raise UsageError(
+                str(script),
+                f"{line.strip()!r}, which starts a python that fragprune does not see",
+                "the word python alone, in an environment that is active already",
+                f"Take that out, or: {_SINGLY}",
+            )
+
+
+def _started_by(here: HostRepo, script: Path) -> list[str]:
+    """What a Python script starts, if a training is among it and it trains nothing itself."""
+    text, tree = here.read(script), here.tree(script.stem)
+    if ".backward(" in text or tree is None:
+        return []
+    nodes = list(ast.walk(tree))
+    calls = {getattr(each.func, "attr", "") for each in nodes if isinstance(each, ast.Call)}
+    said = [each.value for each in nodes if isinstance(each, ast.Constant)]
+    named = [each for each in said if isinstance(each, str) and re.search(r"\w\.py\b", each)]
+    if not (calls & _STARTING and any(re.search(r"train\w*\.py\b", each) for each in named)):
+        return []
+    return named + re.findall("sys.executable", text)
+
+
+def run_sweep(command: Sequence[str], options: Sequence[str], *, quietly: bool) -> Report:
+    """Run such a script, with each of a host's that it starts as if ``fragprune run`` stood there.
+
+    Args:
+        options: the words of ``fragprune run`` in front of the command.
+        quietly: what the scripts print goes to stderr.
+
+    Raises:
+        HostFailed: it ended with an error code, or started nothing that is served.
+        UsageError: this system has no shell for it.
+    """
+    words, name = list(command), shlex.join(command)
+    if os.name != "posix":
+        raise UsageError(name, os.name, "Linux or macOS, for a script of trainings", _SINGLY)
+    if words[0].endswith((".py", ".sh")):
+        words.insert(0, "python" if words[0].endswith(".py") else shutil.which("bash") or "sh")
+    if Path(words[0]).name.startswith("python"):
+        words[0] = sys.executable  # not the one in front of it
+    with tempfile.TemporaryDirectory(prefix="fragprune-") as scratch:
+        folder = Path(scratch)
+        path = os.pathsep.join([str(_shims(folder, options)), os.environ.get("PATH", os.defpath)])
+        log.info("%s: each script of a host that it starts runs as by fragprune run", name)
+        code = _ran(words, folder, os.environ | {"PATH": path}, quietly=quietly)
+        runs = [json.loads(each.read_text()) for each in sorted(folder.glob("run-*.json"))]
+    failed = [each for each in runs if each["exit_code"]]
+    if not runs:
+        found = "it started no script of a host by the word python"
+        raise HostFailed(name, found, "trainings that fragprune can serve", _SINGLY)
+    lines = [_line(each) for each in runs]
+    lines.append(f"{len(runs) - len(failed)} of {len(runs)} commands of a host ended well.")
+    if code:
+        lines.append(f"{name}: ended with exit code {code}.")
+    return Report({"runs": runs, "exit_code": code}, "\n".join(lines), code or int(bool(failed)))
+
+
+def _shims(folder: Path, options: Sequence[str]) -> Path:
+    """Write what is found in place of ``python``; returns its folder."""
+    (folder / OPTIONS).write_text(
+        json.dumps([_anywhere(each) for each in options if each != "--json"])
+    )
+    shims = folder / "bin"
+    shims.mkdir()
+    words = [sys.executable, "-m", "fragprune_plugins.workbench.run.started", str(folder)]
+    text = f'#!/bin/sh\nexec {shlex.join(words)} "$@"\n'
+    major, minor = sys.version_info[:2]
+    for name in ("python", f"python{major}", f"python{major}.{minor}"):
+        (shims / name).write_text(text)
+        (shims / name).chmod(stat.S_IRWXU)
+    return shims
+
+
+def _anywhere(word: str) -> str:
+    """A word that names a file, such as that of --config, so that it does in every folder."""
+    return str(Path(word).resolve()) if Path(word).is_file() else word
+
+
+def _ran(words: list[str], folder: Path, environment: dict[str, str], *, quietly: bool) -> int:
+    """The exit code of the script; a signal ends it first, and is then heard by what it started."""
+    with (
+        sigterm_interrupts(),
+        subprocess.Popen(
+            words, env=environment, stdout=2 if quietly else None, start_new_session=True
+        ) as script,
+    ):
+        try:
+            return script.wait()
+        except KeyboardInterrupt as interrupt:
+            (folder / STOPPED).touch()
+            script.kill()  # a shell would go on with its next line
+            heard = signal.SIGTERM if isinstance(interrupt, Terminate) else signal.SIGINT
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(script.pid, heard)
+            for lock in folder.glob("*.lock"):  # they save what they have learned
+                FileLock(lock).acquire()
+            raise
+
+
+def _line(run: dict[str, Any]) -> str:
+    """What became of a script that was served."""
+    data: dict[str, Any] = run["report"] or {}
+    said = f"python {shlex.join(run['command'])}"
+    if run["exit_code"]:
+        return f"{said}\n  ended with exit code {run['exit_code']}"
+    if not data.get("before"):
+        return f"{said}\n  {data.get('model_after') or 'trained nothing'}"
+    gained = wording.outcome("run", data, data["control"])
+    if data["control"] is None:
+        gained = f"{wording.gain(data['before'], data['after'])}."
+    return f"{said}\n  {gained}\n  {data['model_after']}"

@@ -1,0 +1,182 @@
+"""fragprune run in front of a script that starts trainings: each one is served."""
+
+import json
+import os
+import shlex
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from cli.commands import fails, run
+from cli.test_run_afterwards import TRAINING, WAITING, hear_ctrl_c
+from core.test_verdict import fork as fork  # a fixture
+from miniatures.runs import TINY
+from miniatures.vanilla_3dgs import HOST
+
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.workbench.run import started
+from fragprune_plugins.workbench.run.sweep import OPTIONS, STOPPED, is_sweep
+
+FULL_EVAL = """
+import os
+
+for scene in ("room", "garden"):
+    os.system("python train.py -s " + scene)
+"""
+
+
+def script_of(folder, text, name="sweep.sh"):
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def test_each_script_of_a_host_is_served_and_other_python_is_python(
+    photographs, tmp_path, monkeypatch, capfd
+):
+    train = ["python", "train.py", "-s", photographs, "-m", tmp_path / "out", "--iterations", 10]
+    (tmp_path / "plain.py").write_text("import sys; print('fragprune_plugins' in sys.modules)")
+    (tmp_path / "quick.toml").write_text("iters = 4\n")
+    lines = [
+        f"cd {HOST}  # or conda activate",
+        f"A=1 {shlex.join(map(str, [*train, *TINY]))}",
+        "python3 train.py --nonsense",
+        f"python {tmp_path}/plain.py > {tmp_path}/said",
+        "python -c 'import sys; sys.exit(7)'",
+    ]
+    script = script_of(tmp_path, "\n".join(lines))
+    monkeypatch.chdir(tmp_path)
+    words = ["--config", "quick.toml", "--json", "--device", "cpu", "--", "bash", script]
+    result = run("run", *words)
+    assert result.exit_code == 7, result.stderr
+    assert (tmp_path / "said").read_text() == "False\n"
+    data = json.loads(result.stdout)
+    served, failed = data["runs"]
+    assert data["exit_code"] == 7
+    assert (served["exit_code"], served["report"]["iterations"]) == (0, 4)
+    assert sidecar.find(Path(served["report"]["model_after"]))
+    assert (failed["command"], failed["report"]) == (["train.py", "--nonsense"], None)
+    assert failed["exit_code"] != 0
+    assert "fewer fragments" not in capfd.readouterr().out  # stdout has the object alone
+
+
+def test_a_training_that_fails_fails_the_sweep(tmp_path, monkeypatch):
+    """As ``full_eval.py``, which does not look how its trainings end."""
+    monkeypatch.chdir(HOST)
+    script = script_of(tmp_path, FULL_EVAL.replace('"room", "garden"', '"nothing",'), "all.py")
+    result = run("run", "--device", "cpu", "--", "python", script)
+    assert result.exit_code == 1
+    assert "python train.py -s nothing\n  ended with exit code" in result.stdout
+    assert "0 of 1 commands of a host ended well." in result.stdout
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_what_was_started_and_nothing_more_starts(
+    number, code, fork, photographs, tmp_path
+):
+    root = fork(root=tmp_path / "fork").root
+    training = TRAINING.format(model="none", code=0, shown="").replace("import os", WAITING, 1)
+    (root / "train.py").write_text(training)
+    started_ = f"python {root}/train.py -s {photographs} -m {tmp_path}/out\n"
+    script = script_of(tmp_path, f"{started_}touch {tmp_path}/after\n{started_}")
+    line = [sys.executable, "-m", "fragprune_plugins", "run", "--device", "cpu", "--", "sh", script]
+    how = {"stdout": subprocess.PIPE, "text": True, "start_new_session": True}
+    with subprocess.Popen(list(map(str, line)), **how, preexec_fn=hear_ctrl_c) as run_:
+        pid = int(run_.stdout.readline())
+        run_.send_signal(number)
+        assert run_.wait(60) == code
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
+    assert not (tmp_path / "after").exists()
+
+
+def test_a_script_that_starts_no_training_fails(tmp_path):
+    script = script_of(tmp_path, "python -c 'print(1)'")
+    fails("run", "--", script, says="started no script of a host by the word python", code=1)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "source activate gs",
+        "  conda activate gs && python train.py",
+        "uv run train.py",
+        "/opt/gs/bin/python train.py",
+        "torchrun --nproc-per-node 2 train.py",
+        "python -m torch.distributed.run train.py",
+    ],
+)
+def test_what_would_start_another_python_is_refused_before_anything(line, tmp_path):
+    script = script_of(tmp_path, f"touch {tmp_path}/ran\n{line}\n")
+    fails("run", "--", "bash", script, says=(repr(line.strip()), "in front of each training"))
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "found"),
+    [
+        ('"python train', 'sys.executable + " train', "sys.executable"),
+        ('"python train', '"torchrun train', "torchrun train.py"),
+    ],
+)
+def test_so_is_it_in_a_script_of_python(old, new, found, tmp_path):
+    fails("run", "--", script_of(tmp_path, FULL_EVAL.replace(old, new), "all.py"), says=found)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("", "", True),
+        ("os.system", "subprocess.run", True),
+        ("os.system", "print", False),
+        ("train.py", "render.py", False),
+        ("import os", "import os\nloss.backward()", False),
+    ],
+)
+def test_a_sweep_starts_trainings_and_trains_nothing(old, new, expected, tmp_path):
+    script = script_of(tmp_path, FULL_EVAL.replace(old, new), "all.py")
+    assert is_sweep(["python", str(script)]) == expected
+    assert is_sweep([str(script), "--scene", "room"]) == expected
+
+
+def test_a_log_is_of_a_single_training(tmp_path):
+    script = script_of(tmp_path, "python train.py")
+    fails("run", "--log", f"csv:{tmp_path}/steps.csv", "--", script, says="one training")
+
+
+@pytest.mark.parametrize(
+    ("words", "served"),
+    [
+        ([HOST / "train.py"], True),
+        ([HOST / "render.py", "-m", "out"], True),
+        (["-u", HOST / "train.py"], True),
+        (["-c", "print(1)"], False),
+        (["-m", "json.tool"], False),
+        (["nothere.py"], False),
+        ([], False),
+    ],
+)
+def test_scripts_of_hosts_are_served(words, served, tmp_path, monkeypatch):
+    taken = []
+
+    class TakenError(Exception):
+        pass
+
+    def execv(path, words):
+        taken.append(words)
+        raise TakenError
+
+    monkeypatch.setattr(started.os, "execv", execv)
+    (tmp_path / OPTIONS).write_text("[]")
+    (tmp_path / STOPPED).touch()  # what is served does not start any more
+    with pytest.raises(SystemExit if served else TakenError):
+        started.main(tmp_path, list(map(str, words)))
+    assert taken == ([] if served else [[sys.executable, *map(str, words)]])
+
+
+def test_a_training_that_nothing_serves_is_named_and_runs(tmp_path, caplog):
+    script = script_of(tmp_path, "loss.backward()", "train_features.py")
+    assert not started._is_served([str(script)])
+    assert "train_features.py runs as it is, unpruned" in caplog.text
