@@ -16,6 +16,7 @@ from fragprune_plugins.errors import DatasetError, ModelFileError
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.workbench.finetune import work
 from fragprune_plugins.workbench.models.formats.ply import write_ply
+from fragprune_plugins.workbench.scenes import generated
 from fragprune_plugins.workbench.scenes.dataset import load_dataset
 from fragprune_plugins.workbench.scenes.output import newest_model, trained_on
 
@@ -128,7 +129,8 @@ def test_alpha_that_hides_nothing_is_no_news(data, path, tmp_path):
     assert "alpha" not in result.stderr
 
 
-def test_an_orbit_is_one_also_where_the_trainings_cameras_are_known(output):
+def test_an_orbit_is_one_also_where_the_trainings_cameras_are_known(output, monkeypatch):
+    monkeypatch.setitem(generated.around.__kwdefaults__, "pixels", 60)
     for words in (("profile", output), ("compare", output, output)):
         for option, views in (("--orbit", 12), ("--self", 2)):
             report = run_json(*words, option)
