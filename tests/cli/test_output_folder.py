@@ -236,6 +236,16 @@ def test_a_model_learns_no_photograph_it_shows_under_an_exposure(output, tmp_pat
         assert run(*words).exit_code == 0
 
 
+def test_figures_of_a_model_with_exposures_say_that_they_are_left_out(output):
+    for learned, warned in ((1, False), (2, True)):
+        rows = [[learned, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
+        (output / "exposure.json").write_text(json.dumps({"view03": rows}))
+        for words in (("profile", output), ("compare", output, output)):
+            said = [each for each in run_json(*words)["warnings"] if "view03" in each]
+            assert bool(said) == warned
+    assert not run_json("profile", output, "--self")["warnings"]
+
+
 def test_photographs_that_are_learned_from_too_are_not_said_to_be_held_out(model, tmp_path):
     data = tiny.write_blender(tmp_path / "scene", tiny.photographs(model))
     (data / "transforms_test.json").write_text((data / "transforms_train.json").read_text())

@@ -18,6 +18,7 @@ from fragprune_plugins.workbench.figures.matching import told_or_matched
 from fragprune_plugins.workbench.figures.pictures import leave_panels
 from fragprune_plugins.workbench.models.model import load, writable_folder
 from fragprune_plugins.workbench.scenes.output import trained_on
+from fragprune_plugins.workbench.scenes.training import exposures_left_out
 
 
 def compare(
@@ -71,6 +72,7 @@ def compare(
         "scene": records.plain(photographs) if photographs else None,
         "warnings": wording.nothing_drawn(drawn) + wording.unrelated(before, after),
     }
+    report["warnings"] += exposures_left_out(a, b) if photographs else []
     lines = _lines(report, shown, [shot.view for shot in shots])
     if out is not None:
         columns = dict(zip("AB", candidates, strict=True))

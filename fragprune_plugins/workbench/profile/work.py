@@ -15,6 +15,7 @@ from fragprune_plugins.workbench.figures.matching import told_or_matched
 from fragprune_plugins.workbench.figures.pictures import leave_panels
 from fragprune_plugins.workbench.figures.wording import PROFILED, describe, nothing_drawn
 from fragprune_plugins.workbench.models.model import load, writable_folder
+from fragprune_plugins.workbench.scenes.training import exposures_left_out
 
 
 def profile(
@@ -48,6 +49,7 @@ def profile(
     measurements = measure_all(list(columns.values()), shots, engine=rasterizer)
     measured = dict(zip(columns, measurements, strict=True))
     warnings = nothing_drawn([each["fragments_per_pixel"] for each in measurements])
+    warnings += [] if itself else exposures_left_out(model)
     report: dict[str, Any] = {
         "model": str(model),
         "truncated": loaded.falloff is not None,

@@ -90,6 +90,16 @@ def exposed(model: Path) -> str:
     return ""
 
 
+def exposures_left_out(*models: Path) -> list[str]:
+    """A warning for figures of photographs, if a model was trained with exposures."""
+    names = {str(model): name for model in models if (name := exposed(model))}
+    return [
+        f"{model} was trained with an exposure for each photograph ({name}, for one), and is "
+        "measured without them: its PSNR is lower than its training's."
+        for model, name in names.items()
+    ]
+
+
 def _listed(model: Path) -> list[tuple[str, View]]:
     """The cameras of a training by the names of their photographs, in its order."""
     path = cameras_of(model)
