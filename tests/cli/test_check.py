@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 from cli.commands import fails, run, run_json
+from core.test_verdict import fork as fork  # a fixture
 from miniatures.skeletons import skeleton
 
 from fragprune_plugins.adapting import HostRepo, Role, Seam
@@ -198,6 +199,18 @@ def test_a_folder_whose_scripts_use_the_one_above_names_it(host):
     assert sentence.startswith("Its scripts use the folder above, which fits vanilla-3dgs")
     assert f"fragprune check {host}" in sentence
     assert "To write an adapter" not in result.stdout
+
+
+def test_so_does_one_below_a_fork_whose_ply_is_plain(fork, tmp_path):
+    root = fork().root
+    (root / "gs").mkdir()
+    (root / "gs/train.py").write_text("import scene\n")
+    lines = run("check", root / "gs").stdout.splitlines()
+    assert lines[2] == (
+        "Its scripts use the folder above, which saves plain 3DGS, as run finds: "
+        f"fragprune check {tmp_path}"
+    )
+    assert run("check", root).stdout.splitlines()[2].startswith("No adapter fits, but its PLY")
 
 
 def test_a_fork_that_does_not_fit_is_told_once_why(tmp_path):

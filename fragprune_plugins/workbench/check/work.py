@@ -72,7 +72,7 @@ def _single(
     elif proved:
         sentence = f"It fits {judged.adapter}, and its rasterizer was proved on this machine."
         judged = replace(judged, sentence=sentence, reason="")
-    elif above := "" if fitting else _above(repo, adapters):
+    elif above := "" if fitting else _above(repo, adapters, plugins):
         judged = replace(judged, sentence=above)
     missing = _missing(repo, fits) if isinstance(fits, ScriptAdapter) else []
     lines = [f"{repo.root}" + (f", commit {repo.commit}" if repo.commit else "")]
@@ -239,14 +239,14 @@ def _repository(host: Path, adapters: list[HostAdapter], name: str | None) -> Ho
         return repo
 
 
-def _above(repo: HostRepo, adapters: list[HostAdapter]) -> str:
-    """That the folder above fits, if scripts of this one use it; else ""."""
+def _above(repo: HostRepo, adapters: list[HostAdapter], plugins: Plugins) -> str:
+    """That run serves the folder above, if scripts of this one use it; else ""."""
     for above in folder_above(repo):
-        for fits in closest(attempt(above, adapters), adapters):
-            return (
-                f"Its scripts use the folder above, which fits {fits.name}, as run finds: "
-                f"fragprune check {above.root}"
-            )
+        fits = next(iter(closest(attempt(above, adapters), adapters)), None)
+        if fits or models_of(above, plugins)[0]:
+            which = f"fits {fits.name}" if fits else "saves plain 3DGS"
+            found = f"Its scripts use the folder above, which {which}, as run finds"
+            return f"{found}: fragprune check {above.root}"
     return ""
 
 
