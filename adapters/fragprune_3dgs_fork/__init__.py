@@ -7,11 +7,10 @@ are made if their kernel was read; those that nobody reads raise if they are rea
 
 from __future__ import annotations
 
-import logging
 from argparse import ArgumentParser
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -30,7 +29,15 @@ from fragprune_3dgs_fork.fork import (
     rests_after_densification,
 )
 from fragprune_3dgs_fork.rasterizer import POSES, Output
-from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, kernels, plain, reading
+from fragprune_graphdeco import (
+    SCREEN,
+    GraphdecoAdapter,
+    GraphdecoDialect,
+    kernels,
+    plain,
+    reading,
+    warn_once,
+)
 from fragprune_plugins.adapting import (
     CommandLine,
     EngineError,
@@ -51,15 +58,6 @@ if TYPE_CHECKING:
 
 CHANNELS = 7
 """That are blended beside the colours in one rasterization: engines blend 8, a proof adds one."""
-SCREEN = 3  # columns of the tensor that gets the screen gradient
-
-log = logging.getLogger("fragprune")
-
-
-@cache
-def warn_once(what: str) -> None:
-    """Warn of something once."""
-    log.warning("%s", what)
 
 
 class Unread:
@@ -127,6 +125,8 @@ class ForkDialect(GraphdecoDialect):
         """
         import torch
 
+        if not call.still and call["means2D"].shape[1] > SCREEN:
+            self._refuse("means2D", "absolute screen gradients", "three columns, or stage 2")
         fork, inputs = self.fork, super().unpack(call)
         confidence = getattr(call.settings, "confidence", None)
         if confidence is not None and not bool((confidence == 1).all()):
@@ -138,8 +138,6 @@ class ForkDialect(GraphdecoDialect):
                 self._refuse(name, "a camera's gradients", "cameras that stand still, or stage 2")
         if call.still:
             return inputs
-        if call["means2D"].shape[1] > SCREEN:
-            self._refuse("means2D", "absolute screen gradients", "three columns, or stage 2")
         if fork.scaled:
             warn_once(
                 f"{', '.join(sorted(fork.scaled))}: the gradient on the screen is not changed by "

@@ -20,6 +20,7 @@ from collections.abc import Sequence
 
 from fragprune_graphdeco.adapter import CLONE as CLONE
 from fragprune_graphdeco.adapter import MODEL as MODEL
+from fragprune_graphdeco.adapter import SCREEN as SCREEN
 from fragprune_graphdeco.adapter import SPLIT as SPLIT
 from fragprune_graphdeco.adapter import GraphdecoAdapter as GraphdecoAdapter
 from fragprune_graphdeco.adapter import GraphdecoDialect as GraphdecoDialect
@@ -29,6 +30,7 @@ from fragprune_graphdeco.adapter import model_seam as model_seam
 from fragprune_graphdeco.adapter import no_noise as no_noise
 from fragprune_graphdeco.adapter import optimizers as optimizers
 from fragprune_graphdeco.adapter import rasterizer_seam as rasterizer_seam
+from fragprune_graphdeco.adapter import warn_once as warn_once
 from fragprune_graphdeco.call import CallInSource as CallInSource
 from fragprune_graphdeco.call import RasterizerCall as RasterizerCall
 from fragprune_graphdeco.call import drawing_functions as drawing_functions

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import logging
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from types import MappingProxyType, ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -103,6 +104,16 @@ MODEL_SEAMS: tuple[Seam, ...] = (
 )
 
 
+SCREEN = 3
+"""Columns of the tensor that gets the gradient on the screen."""
+
+
+@cache
+def warn_once(what: str) -> None:
+    """Warn of something once."""
+    logging.getLogger("fragprune").warning("%s", what)
+
+
 @dataclass(frozen=True)
 class GraphdecoDialect(Dialect):
     """The call of diff_gaussian_rasterization and its forks.
@@ -149,6 +160,13 @@ class GraphdecoDialect(Dialect):
         import torch
 
         s, values = call.settings, self.values(call)
+        screen = call.get("means2D")
+        if screen is not None and screen.shape[1] > SCREEN and not call.still:
+            warn_once(
+                f"means2D has {screen.shape[1]} columns: our engines give a gradient to its first "
+                "two, so a densification that reads the others adds no Gaussian; only the host's "
+                "own rasterizer computes them"
+            )
         sh, dc = call.get("shs"), call.get("dc")
         if dc is not None:  # the accelerated rasterizer takes the constant band on its own
             sh = dc if sh is None else torch.cat([dc, sh], dim=1)
@@ -174,7 +192,7 @@ class GraphdecoDialect(Dialect):
                 sh_degree=0 if sh is None else int(s.sh_degree),
                 features=self.features(call),
             ),
-            means2d_hook=call.get("means2D"),
+            means2d_hook=screen,
             scale_modifier=float(s.scale_modifier),
             compensation="antialiasing" if getattr(s, "antialiasing", False) else "none",
             planes=tuple(name for name in ("invdepth", "alpha") if name in values),

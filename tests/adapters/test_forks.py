@@ -11,7 +11,7 @@ import torch
 
 from fragprune_3dgs_fork import ForkDialect, plane_depth
 from fragprune_3dgs_fork.fork import Fork, Output
-from fragprune_graphdeco import likeness, proof
+from fragprune_graphdeco import GraphdecoDialect, likeness, proof, warn_once
 from fragprune_plugins.adapting import EngineError, HostCall, HostRepo
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.injection.rasterizing import further_picture
@@ -190,6 +190,14 @@ def test_a_value_that_was_seen_unread_may_be_handed_on_and_not_read(scene, objec
 def test_what_our_engines_would_leave_out_is_refused(scene, objects, given, what):
     with pytest.raises(EngineError, match=what):
         DIALECT.unpack(call_of(scene, objects, **given))
+
+
+@pytest.mark.parametrize(("columns", "still"), [(3, False), (4, True), (4, False)])
+def test_other_adapters_warn_of_columns_without_a_gradient(scene, objects, caplog, columns, still):
+    """2DGS with MCMC gives means2D four, and densifies by two of these only if asked to."""
+    warn_once.cache_clear()
+    GraphdecoDialect("p", (), 2).unpack(call_of(scene, objects, still=still, columns=columns))
+    assert ("means2D has 4 columns" in caplog.text) == (columns > 3 and not still)
 
 
 @pytest.mark.parametrize(
