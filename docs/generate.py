@@ -45,9 +45,10 @@ def roles() -> str:
     from fragprune_plugins.hosts.seams import Role, RowTrace, Seam, SeamCall
 
     intro = """A *seam* is one function of a host that is wrapped while fragprune is active. An
-adapter lists a host's seams and gives each a role. In every role but RASTERIZE the host's function
-runs unchanged, and fragprune follows. `fragprune check DIR` prints the seams of a checkout with
-file and line.
+adapter lists a host's seams and gives each a role. In most roles the host's function runs
+unchanged, and fragprune follows. RASTERIZE, SIMILARITY and ANSWER answer in its place; STILL and
+REARRANGE leave it out in stage 2. `fragprune check DIR --adapter NAME` prints the seams of a
+checkout with file and line.
 
 A seam's `how` is a function of the adapter for things that only this host does in its own way. It
 takes the `SeamCall`, and is called before, around, after or instead of the host's function.
@@ -133,10 +134,12 @@ def support() -> str:
     table = "\n".join("| " + " | ".join(cells) + " |" for cells in rows)
     installed = " and ".join(f"`{a.name}`" for a in adapters if a.installed and not a.info.usage)
     methods = " and ".join(f"`{a.name}`" for a in adapters if a.info.usage)
+    on_cpu = " and ".join(f"`{a.name}`" for a in adapters if not a.on_gpu)
     intro = f"""Scripts that do not train (render, evaluate) also run under `fragprune run`, with
-the thresholds beside their models. Every adapter draws with every engine: {
+the thresholds beside their models. Every adapter draws with every engine ({
         ", ".join(f"`{name}`" for name in ENGINES)
-    }. `fragprune check DIR` says which adapter fits a checkout, and why others do not. Our adapters
+    }), but {on_cpu} not with `cuda`.
+`fragprune check DIR` says which adapter fits a checkout, and why others do not. Our adapters
 pass the [conformance kit](conformance.md): {installed} on the installed packages, the others on
 miniatures of their hosts. {methods} is a method of its host, with
 [tests of its own](../how-to/nerfstudio.md#test-it)."""

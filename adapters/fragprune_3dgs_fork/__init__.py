@@ -275,7 +275,7 @@ class ForkAdapter(GraphdecoAdapter):
     name = "3dgs-fork"
     info = HostInfo(
         "a fork of 3D Gaussian Splatting",
-        repo="graphdeco-inria/gaussian-splatting and its forks",
+        repo="graphdeco-inria/gaussian-splatting",
         states="any whose model is plain 3DGS",
         limits=(
             "What reading cannot prove is named by fragprune check.",

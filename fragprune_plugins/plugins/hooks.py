@@ -56,7 +56,7 @@ def engine_for(
 
 
 def schedule_for(settings: Settings, plugins: Plugins | None = None) -> Schedule:
-    """The schedule of stage 2: a plugin's, or the paper's.
+    """The schedule of stage 2: a plugin's, or ours.
 
     Raises:
         PluginError: a plugin raised, or its answer is not a schedule.

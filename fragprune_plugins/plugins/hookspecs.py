@@ -72,7 +72,7 @@ def fragprune_create_engine(name: str, device: torch.device) -> Engine | None:
 def fragprune_create_schedule(settings: Settings) -> Schedule | None:
     """Decide when thresholds start, move and stop in stage 2.
 
-    If no plugin answers, the paper's schedule is used.
+    If no plugin answers, our ``Schedule`` is used.
 
     :param settings: the user's settings.
     """

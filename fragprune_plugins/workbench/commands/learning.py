@@ -62,7 +62,7 @@ _OPTIONS = (
         type=float,
         help="Weight of drawn fragments per pixel in the loss; default: "
         f"{2 * ELASTICITY:g} of the loss per fragment ({ELASTICITY:g} unless all parameters "
-        f"learn), from {LEAST_PRESSURE:g} to {MOST_PRESSURE:g}.",
+        f"learn in stage 2), from {LEAST_PRESSURE:g} to {MOST_PRESSURE:g}.",
     ),
     click.option(
         "--target-speedup",
