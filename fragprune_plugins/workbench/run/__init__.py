@@ -53,7 +53,7 @@ RULES = (
     help="Go on where the host's own rasterizer draws otherwise than ours. What nobody proved is "
     "named on stderr.",
 )
-@click.option("--again", is_flag=True, help="Train, or learn, anew, though that is finished.")
+@click.option("--again", is_flag=True, help="Train or learn anew, though it is finished.")
 def command(**options: Any) -> Report:
     """Train with a host's own command, then learn a cutoff for every Gaussian.
 
