@@ -17,7 +17,8 @@ from fragprune_plugins.workbench.commands import cli
 
 ROOT = Path(__file__).parents[2]
 DOCS = [*(ROOT / "docs").rglob("*.md"), *(ROOT / "docs").rglob("*.ipynb")]
-PAGES = [ROOT / "README.md", *(page for page in sorted(DOCS) if "experiments" not in page.parts)]
+DOCS += [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md")]
+PAGES = [page for page in sorted(DOCS) if "experiments" not in page.parts]
 CODE = re.compile(r"^```.*?^```|^ {4}.*?$|`[^`]+`", re.MULTILINE | re.DOTALL)
 COMMAND = re.compile(r"(?<![\w/.-])fragprune(?:_plugins)? +(?!as |stop |rim )([a-z][^\n;&|>()`]*)")
 
