@@ -93,6 +93,23 @@ def test_the_image_folder_can_be_chosen(tmp_path, images, write):
     assert shot.view.tan_fov_x == pytest.approx(tiny.SIDE / (2 * tiny.FOCAL))
 
 
+def test_focal_lengths_without_a_size_are_those_of_the_listed_images(tmp_path, images):
+    """And not of the smaller ones that are read: a lens would be twice as long there."""
+    known = {"fl_x": tiny.FOCAL, "fl_y": tiny.FOCAL, "cx": tiny.SIDE / 2, "cy": tiny.SIDE / 2}
+    write_nerfstudio(tmp_path, images, **known)
+    path = tmp_path / "transforms.json"
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps({key: content[key] for key in content.keys() - {"w", "h"}}))
+    (tmp_path / "images_2").mkdir()
+    for name in NAMES:
+        Image.new("RGB", (tiny.SIDE // 2,) * 2).save(tmp_path / "images_2" / f"{name}.png")
+    view = load_dataset(tmp_path, images="images_2").train[0].view
+    assert view.tan_fov_x == pytest.approx(tiny.SIDE / (2 * tiny.FOCAL))
+    (tmp_path / "images").rename(tmp_path / "elsewhere")
+    with pytest.raises(DatasetError, match=r"images/view\d\d\.png: no such image"):
+        load_dataset(tmp_path)
+
+
 @pytest.mark.parametrize("suffix", [".JPG", ".jpeg", ".PNG", ".webp"])
 def test_images_under_another_suffix_are_found(colmap, suffix):
     for path in list((colmap / "images").iterdir()):

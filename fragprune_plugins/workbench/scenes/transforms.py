@@ -76,8 +76,8 @@ def read_transforms(path: Path, images: str = "images") -> list[Posed]:
 
     Every number may stand in a frame or in the file. Intrinsics are ``fl_x, fl_y, cx, cy`` where
     given, else ``camera_angle_x``, ``camera_angle_y`` and a centred principal point; ``w, h`` where
-    given, else the size of the image. Poses are taken as they stand: an ``applied_transform`` has
-    been applied.
+    given, else the size of the image that the file lists, which then has to be there. Poses are
+    taken as they stand: an ``applied_transform`` has been applied.
     """
     content = load_json(path)
     with _TRANSFORMS.stated(path) as reading:
@@ -125,8 +125,10 @@ def _name(image: Path) -> str:
 def _row(folder: Path, frame: dict[str, Any], images: str) -> Posed:
     listed = Path(frame["file_path"])
     image = find_image(folder / (listed if images == "images" else Path(images) / listed.name))
-    width, height = (int(frame["w"]), int(frame["h"])) if "w" in frame else image_size(image)
     known = "fl_x" in frame
+    # Pixels of the listed image; an angle is the same in an image of any size.
+    measured = find_image(folder / listed) if known else image
+    width, height = (int(frame["w"]), int(frame["h"])) if "w" in frame else image_size(measured)
     fx = float(frame["fl_x"]) if known else focal(width, float(frame["camera_angle_x"]))
     fy = focal(height, float(frame["camera_angle_y"])) if "camera_angle_y" in frame else fx
     usual = {"fl_y": fy, "cx": width / 2, "cy": height / 2}
