@@ -3,6 +3,7 @@
 import json
 import math
 import signal
+from dataclasses import replace
 
 import pytest
 import torch
@@ -143,6 +144,15 @@ def test_photographs_of_another_scene_are_told_before_the_learning(path, model, 
     told = run(*words, 3).stderr
     assert "warning: MODEL shows its photographs at" in told
     assert "--white-background" in told
+
+
+def test_a_model_that_was_moved_is_told_before_the_learning(path, model, words):
+    """However much better a dark picture is than 12 dB."""
+    moved = replace(model, xyz=model.xyz + torch.tensor([1.0, 0.0, 0.0]))
+    write_ply(path, moved)
+    told = run(*words, 3).stderr
+    assert "warning: MODEL shows its photographs at" in told
+    assert "--self" in told
 
 
 ALIKE = {"train": "all", "opacity_lr": None, "seed": 0, "views_per_step": 1}

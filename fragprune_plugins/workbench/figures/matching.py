@@ -13,6 +13,7 @@ from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.learning.stage2 import evenly_spaced
 from fragprune_plugins.workbench.figures.evaluate import Candidate, psnrs
+from fragprune_plugins.workbench.figures.metrics import psnr
 from fragprune_plugins.workbench.scenes.dataset import OFF_CENTRE, Dataset, load_photographs
 
 
@@ -52,3 +53,16 @@ def told_or_matched(model: Model, read: Photographs, engine: Engine) -> tuple[Ph
 def shown(model: Model, dataset: Dataset, engine: Engine) -> float:
     """How well a model shows up to eight training pictures, dB of PSNR."""
     return statistics.fmean(psnrs(Candidate(model), evenly_spaced(dataset.train, 8), engine)[0])
+
+
+def shown_and_plain(model: Model, dataset: Dataset, engine: Engine) -> tuple[float, float]:
+    """How well a model shows up to eight training pictures, and one colour each does, dB of PSNR.
+
+    They are medians: a picture may itself be of one colour, which shows it without any error.
+    """
+    shots = evenly_spaced(dataset.train, 8)
+    plain = []
+    for shot in shots:
+        colour = shot.image.mean(dim=(1, 2), keepdim=True).expand_as(shot.image)
+        plain.append(psnr(shot.looked_at(colour), shot.image))
+    return statistics.median(psnrs(Candidate(model), shots, engine)[0]), statistics.median(plain)

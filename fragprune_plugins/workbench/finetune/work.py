@@ -24,7 +24,7 @@ from fragprune_plugins.workbench.commands.options import require_several
 from fragprune_plugins.workbench.distributed import ShardedEngine, part_of, whole_of
 from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.figures.evaluate import Candidate
-from fragprune_plugins.workbench.figures.matching import matched, shown
+from fragprune_plugins.workbench.figures.matching import matched, shown_and_plain
 from fragprune_plugins.workbench.finetune import api, resuming
 from fragprune_plugins.workbench.finetune.finished import Asked, Finetuned, Opened, finished
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
@@ -42,10 +42,10 @@ from fragprune_plugins.workbench.scenes.training import exposed, moved, saw_held
 
 _say = partial(click.echo, err=True)
 
-OTHER_SCENE = 12.0
-"""dB of PSNR below which photographs are those of another scene, or over another background.
+OTHER_SCENE = 3.0
+"""dB of PSNR that a model has to be above pictures of one colour each, to be one of the scene.
 
-Plain grey reaches 7 to 13 dB on five scenes, black instead of a white background 2 dB on one.
+Trained models are by ten or more. A model that was moved is at -6 to 3 in an object's photographs.
 """
 
 
@@ -135,13 +135,17 @@ def _tried(opened: Opened) -> tuple[Opened, float | None]:
 
 def _warn_of_another_scene(opened: Opened, dataset: Dataset) -> None:
     """Warn before the learning of photographs that the model does not show."""
-    showing = shown(opened.whole, dataset, opened.engine)
-    if showing < OTHER_SCENE:
+    if opened.asked.itself:
+        return
+    showing, plain = shown_and_plain(opened.whole, dataset, opened.engine)
+    if showing < plain + OTHER_SCENE:
         _say(
-            f"warning: MODEL shows its photographs at {showing:.1f} dB PSNR, as if they were of "
-            "another scene. Check --data, --images, --resolution and --white-background."
+            f"warning: MODEL shows its photographs at {showing:.1f} dB PSNR, and pictures of one "
+            f"colour each at {plain:.1f}, as if they were of another scene. Check --data, "
+            "--images, --resolution and --white-background. If an editor or nerfstudio has moved, "
+            "turned or scaled MODEL, learn from its own pictures with --self."
         )
-    if not opened.asked.itself and (name := moved(opened.asked.model, dataset)):
+    if name := moved(opened.asked.model, dataset):
         _say(
             f"warning: in the training of MODEL the camera of {printable(name)} was elsewhere, by "
             f"its {CAMERAS}: a model must not learn photographs from cameras other than its own. "
