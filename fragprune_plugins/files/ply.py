@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from fragprune_plugins.constants import NEUTRAL_LOGIT
 from fragprune_plugins.errors import ModelFileError, log
 from fragprune_plugins.files.columns import change_of, is_plain
 from fragprune_plugins.files.model import REST_COUNTS, Model
@@ -24,7 +25,7 @@ from fragprune_plugins.files.reading import Reading, UntrustedFile
 from fragprune_plugins.learning.thresholds import ThresholdStore
 
 THRESHOLD_COLUMN = "trunc_threshold"
-"""Holds the thresholds themselves, in falloff, in (0, 1)."""
+"""Holds the thresholds themselves, in falloff, in (0, 1); 0 is read as neutral."""
 
 STOP = "fragprune stop"
 """Begins the comment that holds a model's stop."""
@@ -56,6 +57,7 @@ _warn = cache(log.warning)  # once, because commands read a file several times
 
 _SHOWN_COLUMNS = 12
 _BLOCK = 4096  # rows that are read column by column, so that they stay in the cache
+_ENDLESS = 80.0  # in place of infinite logits and logarithms: exp(-80) is nothing, squared 0
 _SHOWN_ROWS = 5  # of those that a message is about
 
 
@@ -102,7 +104,7 @@ def _splat(path: Path, columns: Columns, filtered: bool) -> Model:
     names, count = columns.keys(), len(next(iter(columns.values())))
     scales = SCALES if SCALES[2] in names else SCALES[:2]
     missing = [name for name in (*XYZ, *DC, "opacity", *scales, *ROTATION) if name not in names]
-    if missing == list(DC):
+    if missing == list(DC) and "red" not in names:
         raise ModelFileError(
             str(path),
             "activated Gaussians without colours, from a codebase that keeps colours in a network",
@@ -111,7 +113,8 @@ def _splat(path: Path, columns: Columns, filtered: bool) -> Model:
         )
     if missing:
         expected = "the columns of a Gaussian splat"
-        remedy = "A point cloud or mesh is not a trained splat. " + _REMEDY
+        remedy = "A point cloud or mesh is not a trained splat; ns-export writes one with "
+        remedy += "--ply-color-mode sh_coeffs. " + _REMEDY
         raise ModelFileError(str(path), f"a PLY without {', '.join(missing)}", expected, remedy)
     if scales != SCALES and not filtered:
         raise ModelFileError(
@@ -143,8 +146,9 @@ def _splat(path: Path, columns: Columns, filtered: bool) -> Model:
         with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite, and is refused
             for first in range(0, count if wanted else 0, _BLOCK):
                 rows = slice(first, first + _BLOCK)
-                several = [columns[name][rows] for name in wanted]
-                np.stack(several, axis=1, out=data[rows])
+                np.stack([columns[name][rows] for name in wanted], axis=1, out=data[rows])
+        if wanted in (("opacity",), scales):  # of 0 and 1, which editors write
+            np.nan_to_num(data, copy=False, nan=np.nan, posinf=_ENDLESS, neginf=-_ENDLESS)
         _require_finite(path, wanted, data)
         return torch.from_numpy(data)
 
@@ -193,11 +197,8 @@ def read_thresholds(path: Path) -> ThresholdStore | None:
         return None
     with _FILE.reading(path) as reading:
         rules, columns = _rules_in(reading), read_vertices(reading)
-        if (values := columns.get(THRESHOLD_COLUMN)) is None:
-            store = ThresholdStore(len(next(iter(columns.values()))))
-        else:
-            store = _store_of(path, torch.from_numpy(values.astype(np.float32)))
-        return store.ruled(**rules)
+        values = columns.get(THRESHOLD_COLUMN, np.zeros(len(next(iter(columns.values())))))
+        return _store_of(path, torch.from_numpy(values.astype(np.float32))).ruled(**rules)
 
 
 def _require_finite(path: Path, names: tuple[str, ...], data: np.ndarray[Any, Any]) -> None:
@@ -206,7 +207,7 @@ def _require_finite(path: Path, names: tuple[str, ...], data: np.ndarray[Any, An
         columns = bad.any(axis=0) if len(names) == bad.shape[1] else [True]
         where = ", ".join(n for n, b in zip(names, columns, strict=True) if b)
         found = f"NaN or infinity in {_rows(torch.from_numpy(bad.any(axis=1)), where)}"
-        remedy = "The training that wrote it diverged; use an earlier checkpoint."
+        remedy = "Remove these rows, or use an earlier checkpoint if its training diverged."
         raise ModelFileError(str(path), found, "finite numbers", remedy)
 
 
@@ -237,17 +238,16 @@ def expect_drawable(path: Path, splat: Model) -> None:
 
 def _rows(wrong: Tensor, columns: str = "") -> str:
     """How many rows are wrong (N,) bool, in which columns, and the first of them, from 0."""
-    rows = wrong.nonzero()[:, 0]
-    listed = ", ".join(map(str, rows[:_SHOWN_ROWS].tolist()))
-    more = ", ..." if len(rows) > _SHOWN_ROWS else ""
-    where = f" ({columns})" if columns else ""
-    return f"{len(rows)} of {len(wrong)} rows{where}: {listed}{more}"
+    rows, where = wrong.nonzero()[:, 0].tolist(), f" ({columns})" if columns else ""
+    listed = ", ".join(map(str, rows[:_SHOWN_ROWS])) + ", ..." * (len(rows) > _SHOWN_ROWS)
+    return f"{len(rows)} of {len(wrong)} rows{where}: {listed}"
 
 
 def _store_of(path: Path, values: Tensor) -> ThresholdStore:
-    outside = ~((values > 0) & (values < 1))
+    outside = ~((values >= 0) & (values < 1))
     if outside.any():
-        found = f"{THRESHOLD_COLUMN} outside (0, 1) in {_rows(outside)}"
+        found = f"{THRESHOLD_COLUMN} outside [0, 1) in {_rows(outside)}"
         remedy = "Export the model again with fragprune export."
-        raise ModelFileError(str(path), found, "falloff thresholds in (0, 1)", remedy)
-    return ThresholdStore.from_falloff(values)
+        raise ModelFileError(str(path), found, "falloff thresholds", remedy)
+    # Whoever merges a pruned model with another fills the column with 0.
+    return ThresholdStore.from_falloff(values.where(values > 0, math.exp(NEUTRAL_LOGIT)))

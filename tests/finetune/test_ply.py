@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 
 from fragprune_plugins.adapting import InputError, Model, ModelFileError
+from fragprune_plugins.constants import NEUTRAL_LOGIT
 from fragprune_plugins.files.ply import expect_drawable, read_ply
 from fragprune_plugins.workbench.models.formats.ply import write_ply
 
@@ -163,6 +164,43 @@ def test_activation(tmp_path):
     torch.testing.assert_close(splats.rotations.norm(dim=1), torch.ones(5))
     assert splats.sh.shape == (5, 16, 3)
     assert splats.sh_degree == 3
+
+
+@pytest.mark.parametrize("name", ["opacity", "scale_1"])
+@pytest.mark.parametrize("value", [-np.inf, np.inf])
+def test_opacities_of_0_and_1_and_scales_of_0_are_read_as_such(tmp_path, name, value):
+    """Editors write them; SuperSplat's splat-transform lets exactly these pass."""
+    model = tiny.random_model(4)
+    write_ply(tmp_path / "m.ply", model)
+    given = columns(tmp_path / "m.ply")
+    given[name][2] = value
+    write_columns(tmp_path / "m.ply", given)
+    if (name, value) == ("scale_1", np.inf):
+        with pytest.raises(ModelFileError, match="scales that nothing can be drawn with"):
+            read_ply(tmp_path / "m.ply")
+        return
+    read = read_ply(tmp_path / "m.ply").splats()
+    drawn = read.opacities[2] if name == "opacity" else read.scales[2, 1]
+    assert float(drawn) == pytest.approx(float(value > 0), abs=1e-30)
+
+
+def test_rows_of_an_unpruned_model_that_were_merged_in_are_not_cut(tmp_path):
+    """Whoever merges two PLYs fills a column that one of them lacks with 0."""
+    write_ply(tmp_path / "m.ply", tiny.cut(tiny.random_model(4), 0.3))
+    given = columns(tmp_path / "m.ply")
+    given["trunc_threshold"][2:] = 0
+    write_columns(tmp_path / "m.ply", given)
+    read = read_ply(tmp_path / "m.ply")
+    assert read.falloff[:2].tolist() == pytest.approx([0.3, 0.3])
+    assert (read.thresholds.logits[2:] <= NEUTRAL_LOGIT).all()
+
+
+def test_colours_without_sh_are_named_with_who_writes_them(tmp_path):
+    write_ply(tmp_path / "m.ply", tiny.random_model(4, degree=0))
+    given = {n: each for n, each in columns(tmp_path / "m.ply").items() if "f_dc" not in n}
+    write_columns(tmp_path / "m.ply", given | dict.fromkeys(("red", "green", "blue"), np.ones(4)))
+    with pytest.raises(ModelFileError, match=r"without f_dc_0.*--ply-color-mode sh_coeffs"):
+        read_ply(tmp_path / "m.ply")
 
 
 def without(*names):
