@@ -1,5 +1,7 @@
 """Loading and saving a model from Python."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from cli.commands import run_json
@@ -52,3 +54,14 @@ def test_what_cannot_be_saved_leaves_nothing(model, tmp_path):
     with pytest.raises(DivergedError):
         fp.save(tmp_path / "a.ply", model)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("offset", "warned"), [(1e3, False), (4e6, True)])
+def test_a_model_whose_places_are_rounder_than_its_gaussians_is_warned_of(
+    tmp_path, caplog, offset, warned
+):
+    """As one of a georeferenced scene; float32 has steps of 0.25 at 4,000 km north."""
+    model = tiny.random_model()
+    write_ply(tmp_path / "m.ply", replace(model, xyz=model.xyz + torch.tensor([0, offset, 0])))
+    fp.load(tmp_path / "m.ply")
+    assert ("far from the origin" in caplog.text) == warned
