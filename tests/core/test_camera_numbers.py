@@ -169,7 +169,7 @@ def test_a_quaternion_that_is_no_rotation_is_refused(quaternion):
         colmap._rotation(quaternion)
 
 
-CODES = {7: 5, 10: 12}
+CODES = {7: 5, 10: 12, 11: 16, 12: 4, 13: 5}
 
 
 def binary(tmp_path, cameras, images):
@@ -229,7 +229,7 @@ def test_a_colmap_model_gives_every_number(tmp_path, write):
     assert colmap.read(tmp_path, "images_4")[0][0][2] == tmp_path / "images_4/b c.png"
 
 
-@pytest.mark.parametrize("code", [7, 10, 11, -1])
+@pytest.mark.parametrize("code", [*CODES, 99, -1])
 def test_a_lens_that_nothing_can_straighten_is_refused_by_its_name(tmp_path, code):
     cameras = [camera(7, code, *[1.0] * CODES.get(code, 3))]
     name = colmap._MODELS[code][0] if code in CODES else f"camera model number {code}"

@@ -45,8 +45,13 @@ _MODELS = {
     8: ("SIMPLE_RADIAL_FISHEYE", 1, 1),
     9: ("RADIAL_FISHEYE", 1, 2),
     10: ("THIN_PRISM_FISHEYE", 2, 8),
+    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 2, 12),
+    12: ("SIMPLE_DIVISION", 1, 1),
+    13: ("DIVISION", 2, 1),
 }
-_FOREIGN = ("FOV", "THIN_PRISM_FISHEYE")  # OpenCV cannot straighten them
+_FOREIGN = tuple(_MODELS[number][0] for number in (7, 10, 11, 12, 13))
+"""OpenCV cannot straighten them."""
+
 _OPENCV = {name: counts for name, *counts in _MODELS.values() if name not in _FOREIGN}
 
 Pose = tuple[str, int, tuple[float, ...], tuple[float, ...]]
