@@ -110,6 +110,21 @@ def test_focal_lengths_without_a_size_are_those_of_the_listed_images(tmp_path, i
         load_dataset(tmp_path)
 
 
+def test_a_file_of_the_scene_in_place_of_its_folder_is_told(tmp_path, images):
+    write_nerfstudio(tmp_path, images)
+    with pytest.raises(DatasetError, match=f"a file; expected a folder .* Pass {tmp_path}"):
+        load_dataset(tmp_path / "transforms.json")
+
+
+def test_a_photograph_that_lies_on_its_side_is_told_to_be_turned(colmap):
+    Image.new("RGB", (32, 48)).save(colmap / "images" / "view03.png")
+    (colmap / "sparse" / "0" / "cameras.txt").write_text("7 PINHOLE 48 32 36 36 24 16\n")
+    for name in {*NAMES} - {"view03"}:
+        Image.new("RGB", (48, 32)).save(colmap / "images" / f"{name}.png")
+    with pytest.raises(DatasetError, match=r"view03\.png: 32x48 pixels.*EXIF"):
+        load_dataset(colmap)
+
+
 @pytest.mark.parametrize("suffix", [".JPG", ".jpeg", ".PNG", ".webp"])
 def test_images_under_another_suffix_are_found(colmap, suffix):
     for path in list((colmap / "images").iterdir()):

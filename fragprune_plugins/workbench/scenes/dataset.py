@@ -334,8 +334,10 @@ def read_scene(folder: Path, images: str = "images") -> tuple[list[Posed], list[
     DatasetError as of ``load_dataset``.
     """
     if not os.path.isdir(folder):  # False for a name that no folder can have, too
+        file = os.path.isfile(folder)
+        found, remedy = ("a file", f"Pass {folder.parent}.") if file else ("no such folder", "")
         expected = "a folder with photographs"
-        raise DatasetError(str(folder), "no such folder", expected, "Check --data.")
+        raise DatasetError(str(folder), found, expected, remedy or "Check --data.")
     model = colmap.find_model(folder)
     known = transforms.has_transforms(folder)
     if model is not None and known and model != folder / colmap.NERFSTUDIOS:
@@ -394,9 +396,11 @@ def _expect_aspect(
     """Raise DatasetError if a picture has another aspect than it should."""
     (width, height), (wide, high) = size, expected
     if abs(width * high / (height * wide) - 1) > _ASPECT_TOLERANCE:
+        lying = abs(width * wide / (height * high) - 1) <= _ASPECT_TOLERANCE
+        remedy = "Turn its pixels as its EXIF orientation says (exiftran -ai). " if lying else ""
         raise DatasetError(
             str(path),
             f"{width}x{height} pixels",
             f"those of {whose}, {wide}x{high}, or that aspect",
-            "Use the images that the cameras were calibrated with.",
+            remedy + "Use the images that the cameras were calibrated with.",
         )
