@@ -75,8 +75,8 @@ class Reading:
             raise EOFError(f"{count} bytes announced at byte {at}, where {self.left} are left")
 
     def text(self) -> str:
-        """The rest of the file as UTF-8."""
-        return self.file.read().decode("utf-8")
+        """The rest of the file as UTF-8, with or without the mark that Windows begins it with."""
+        return self.file.read().decode("utf-8-sig")
 
     def json(self) -> Any:
         """The rest of the file as a JSON value of at most ``NESTING`` levels."""

@@ -116,6 +116,12 @@ def test_a_file_of_the_scene_in_place_of_its_folder_is_told(tmp_path, images):
         load_dataset(tmp_path / "transforms.json")
 
 
+def test_json_may_begin_as_windows_begins_it(tmp_path, images):
+    path = write_nerfstudio(tmp_path, images) / "transforms.json"
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert len(load_dataset(tmp_path).train) == 7
+
+
 def test_a_photograph_that_lies_on_its_side_is_told_to_be_turned(colmap):
     Image.new("RGB", (32, 48)).save(colmap / "images" / "view03.png")
     (colmap / "sparse" / "0" / "cameras.txt").write_text("7 PINHOLE 48 32 36 36 24 16\n")
