@@ -110,6 +110,33 @@ def test_focal_lengths_without_a_size_are_those_of_the_listed_images(tmp_path, i
         load_dataset(tmp_path)
 
 
+def test_frames_without_images_are_left_out_and_counted(tmp_path, images, caplog):
+    """instant-ngp's own fox lists seventeen."""
+    write_nerfstudio(tmp_path, images)
+    for name in NAMES[2:4]:
+        (tmp_path / "images" / f"{name}.png").unlink()
+    data = load_dataset(tmp_path)
+    assert len(data.train) + len(data.test) == 7
+    assert "left out 2 of its 9 frames" in caplog.text
+    for name in {*NAMES} - {*NAMES[2:4]}:
+        (tmp_path / "images" / f"{name}.png").unlink()
+    with pytest.raises(DatasetError, match="no such image"):
+        load_dataset(tmp_path)
+
+
+def test_a_listed_name_that_no_frame_has_is_told(tmp_path, images):
+    """Fewer views would be held out than somebody believes."""
+    write_nerfstudio(tmp_path, images, test_filenames=["images/view01.png", "view02.png"])
+    with pytest.raises(DatasetError, match=r"1 names of its lists that no frame has: view02"):
+        load_dataset(tmp_path)
+
+
+def test_views_for_validation_are_held_out_where_none_are_for_a_test(tmp_path, images):
+    tiny.write_blender(tmp_path, images)
+    (tmp_path / "transforms_test.json").rename(tmp_path / "transforms_val.json")
+    assert stems(load_dataset(tmp_path).test) == ["view00", "view08"]
+
+
 def test_a_file_of_the_scene_in_place_of_its_folder_is_told(tmp_path, images):
     write_nerfstudio(tmp_path, images)
     with pytest.raises(DatasetError, match=f"a file; expected a folder .* Pass {tmp_path}"):

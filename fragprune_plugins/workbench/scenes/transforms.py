@@ -7,13 +7,16 @@ from typing import Any
 
 import torch
 
-from fragprune_plugins.errors import DatasetError, log
+from fragprune_plugins.errors import DatasetError, log, printable
 from fragprune_plugins.files.reading import MEBIBYTE, UntrustedFile
 from fragprune_plugins.workbench.scenes.images import find_image, image_size
 from fragprune_plugins.workbench.scenes.pinhole import focal
 from fragprune_plugins.workbench.scenes.posed import Lens, Posed, split
 
 PAIR = ("transforms_train.json", "transforms_test.json")
+VALIDATION = "transforms_val.json"
+"""Stands for the second of them where that is not there."""
+
 SINGLE = "transforms.json"
 
 _PINHOLES = ("", "PINHOLE", "SIMPLE_PINHOLE")
@@ -48,7 +51,9 @@ def read(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]
     with the images, if it is another than the file says.
     """
     if (folder / PAIR[0]).exists():
-        train, test = (read_transforms(folder / name, images) for name in PAIR)
+        alone = not (folder / PAIR[1]).exists() and (folder / VALIDATION).exists()
+        names = (PAIR[0], VALIDATION) if alone else PAIR
+        train, test = (read_transforms(folder / name, images) for name in names)
         return train, test
     path = folder / SINGLE
     rows = read_transforms(path, images)
@@ -59,7 +64,11 @@ def read(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]
             for keys in (("train_filenames",), ("test_filenames", "val_filenames"))
         )
         files = [_listed(frame["file_path"]) for frame in content["frames"]]
-    named = list(zip(rows, files, strict=True))
+    if unknown := (kept | held).difference(files):
+        found = f"{len(unknown)} names of its lists that no frame has: {min(unknown)}"
+        remedy = "Write them as in file_path, folders and all."
+        raise DatasetError(str(path), found, "the file_path of a frame for each", remedy)
+    named = _there(path, list(zip(rows, files, strict=True)))
     wanted = [row for row, file in named if file not in held and (not kept or file in kept)]
     if held:
         return wanted, [row for row, file in named if file in held]
@@ -69,6 +78,22 @@ def read(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]
         "views that it was trained on"
     )
     return split(wanted)
+
+
+def _there(path: Path, named: list[tuple[Posed, Path]]) -> list[tuple[Posed, Path]]:
+    """The frames whose images are there; all if none is, which is another mistake.
+
+    instant-ngp leaves frames without images out, and its own scenes list some.
+    """
+    there = [each for each in named if each[0].image.exists()]
+    if there and len(there) < len(named):
+        (gone, _), *_ = (each for each in named if not each[0].image.exists())
+        log.warning(
+            "%s: left out %d of its %d frames, which have no image, such as %s",
+            *(printable(str(path)), len(named) - len(there), len(named)),
+            printable(str(gone.image)),
+        )
+    return there or named
 
 
 def read_transforms(path: Path, images: str = "images") -> list[Posed]:
