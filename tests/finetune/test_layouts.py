@@ -158,6 +158,20 @@ def test_a_photograph_that_lies_on_its_side_is_told_to_be_turned(colmap):
         load_dataset(colmap)
 
 
+def test_smaller_images_may_be_rounded_to_a_pixel(colmap):
+    """An eighth of 180 rows is 22.5: 2 % of the aspect."""
+    (colmap / "sparse" / "0" / "cameras.txt").write_text("7 PINHOLE 320 180 360 360 160 90\n")
+    for size, kept in (((40, 22), True), ((40, 23), True), ((40, 21), False)):
+        for name in NAMES:
+            Image.new("RGB", size).save(colmap / "images" / f"{name}.png")
+        if kept:
+            view = load_dataset(colmap).train[0].view
+            assert view.tan_fov_y == pytest.approx(90 / 360)
+            continue
+        with pytest.raises(DatasetError, match="40x21 pixels"):
+            load_dataset(colmap)
+
+
 @pytest.mark.parametrize("suffix", [".JPG", ".jpeg", ".PNG", ".webp"])
 def test_images_under_another_suffix_are_found(colmap, suffix):
     for path in list((colmap / "images").iterdir()):

@@ -395,7 +395,8 @@ def _expect_aspect(
 ) -> None:
     """Raise DatasetError if a picture has another aspect than it should."""
     (width, height), (wide, high) = size, expected
-    if abs(width * high / (height * wide) - 1) > _ASPECT_TOLERANCE:
+    rounded = max(wide, high) if width < wide and height < high else 0  # to a pixel, on the way
+    if abs(width * high - height * wide) > max(_ASPECT_TOLERANCE * height * wide, rounded):
         lying = abs(width * wide / (height * high) - 1) <= _ASPECT_TOLERANCE
         remedy = "Turn its pixels as its EXIF orientation says (exiftran -ai). " if lying else ""
         raise DatasetError(
