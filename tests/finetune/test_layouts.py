@@ -4,6 +4,7 @@ import json
 import logging
 import math
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -170,6 +171,20 @@ def test_smaller_images_may_be_rounded_to_a_pixel(colmap):
             continue
         with pytest.raises(DatasetError, match="40x21 pixels"):
             load_dataset(colmap)
+
+
+def test_parts_of_a_scene_that_colmap_could_not_join_are_told(colmap, caplog):
+    whole, sparse = colmap / "sparse" / "0", colmap / "sparse"
+    shutil.copytree(whole, sparse / "1")
+    load_dataset(colmap)
+    assert "larger part" not in caplog.text
+    lines = (whole / "images.txt").read_text().splitlines(keepends=True)
+    (whole / "images.txt").write_text("".join(lines[:9]))
+    load_dataset(colmap)
+    assert f"{sparse / '1'} is a larger part of the scene" in caplog.text
+    shutil.rmtree(whole)
+    with pytest.raises(DatasetError, match=rf"Rename {sparse / '1'} to 0"):
+        load_dataset(colmap)
 
 
 @pytest.mark.parametrize("suffix", [".JPG", ".jpeg", ".PNG", ".webp"])

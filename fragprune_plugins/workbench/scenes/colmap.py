@@ -13,7 +13,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from fragprune_plugins.errors import DatasetError
+from fragprune_plugins.errors import DatasetError, log, printable
 from fragprune_plugins.files.reading import Reading, UntrustedFile
 from fragprune_plugins.workbench.scenes.images import find_image
 from fragprune_plugins.workbench.scenes.posed import Lens, Posed, split
@@ -69,6 +69,22 @@ def find_model(folder: Path) -> Path | None:
     return None
 
 
+def others(folder: Path) -> list[Path]:
+    """The folders of sparse/1, sparse/2, ... of a scene that COLMAP could not join; by number."""
+    inside = (folder / "sparse").glob("[1-9]*")
+    return sorted(each for each in inside if _images_file(each).exists())
+
+
+def _size(model: Path) -> int:
+    return _images_file(model).stat().st_size
+
+
+def _images_file(model: Path) -> Path:
+    """A model's list of images: binary first, as hosts have it; text is an export."""
+    binary = model / "images.bin"
+    return binary if binary.exists() else model / "images.txt"
+
+
 def read(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]]:
     """Read training and held-out views of a folder in which ``find_model`` finds something."""
     model = find_model(folder)
@@ -80,6 +96,13 @@ def read(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]
     else:
         found = model / "cameras.txt", model / "images.txt"
         parsers = _cameras_text, _images_text
+    larger = (each for each in others(folder) if _size(each) > _size(model))
+    if model == folder / "sparse" / "0" and (other := max(larger, key=_size, default=None)):
+        log.warning(
+            "%s: reading sparse/0, as hosts do, but %s is a larger part of the scene: its "
+            "photographs are not in the figures. If the model was trained on them, exchange both",
+            *(printable(str(folder)), printable(str(other))),
+        )
     with _FILE.reading(found[0]) as reading:
         cameras = dict(parsers[0](reading))
     rows = []

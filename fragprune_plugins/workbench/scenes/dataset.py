@@ -363,6 +363,8 @@ def _where_else(folder: Path) -> str:
     for other in (folder.parent, *sorted(each for each in folder.iterdir() if each.is_dir())):
         if colmap.find_model(other) is not None or transforms.has_transforms(other):
             return f"Pass {other}."
+    if parts := colmap.others(folder):
+        return f"Rename {parts[0]} to 0."
     if any(each.suffix.lower() in SUFFIXES for each in folder.iterdir()):
         return "These images have no cameras; run COLMAP on them first."
     return "Pass the folder that contains them."
