@@ -343,6 +343,26 @@ def test_a_mask_that_hides_everything_is_refused(colmap):
         measure(tiny.random_model(), data, repeats=1)
 
 
+@pytest.mark.parametrize("mode", ["1", "L", "P", "LA", "RGB", "RGBA"])
+def test_masks_of_any_mode_hide_what_is_black_or_transparent(colmap, mode):
+    """An editor's cut-out is white everywhere, and only its alpha says where it is."""
+    path = colmap / "masks" / "view01.png"
+    mask_half(path)
+    half = Image.open(path)
+    clear = Image.merge("RGBA", (*[Image.new("L", half.size, 255)] * 3, half))
+    (clear if mode.endswith("A") else half).convert(mode).save(path)
+    image = load_dataset(colmap).train[0].image
+    assert float(image[..., : tiny.SIDE // 2].abs().max()) == 0
+    assert float(image[..., tiny.SIDE // 2 :].min()) > 0
+
+
+def test_a_mask_of_zeros_and_ones_is_told_its_levels(colmap):
+    (colmap / "masks").mkdir()
+    Image.new("L", (tiny.SIDE, tiny.SIDE), 1).save(colmap / "masks" / "view01.png")
+    with pytest.raises(DatasetError, match=r"grey levels end at 1; expected .* from 128 on"):
+        _ = load_dataset(colmap).train[0].image
+
+
 def test_a_mask_of_another_aspect_is_refused(colmap):
     path = colmap / "masks" / "view03.png"
     path.parent.mkdir()

@@ -179,12 +179,13 @@ class Photograph(Shot):
         if self.mask is not None:
             with opened(self.mask) as file:
                 _expect_aspect(self.mask, file.size, "its photograph", whole)
-                seen = self._fitted(file.convert("L"), size) >= _SEEN
+                levels = self._fitted(file.convert("RGBA").convert("LA"), size)
+            seen = levels.min(axis=2) >= _SEEN  # what is transparent is black
             if not seen.any():
                 raise DatasetError(
                     str(self.mask),
-                    "a mask that is black everywhere",
-                    "some of the photograph to look at",
+                    f"a mask that is black everywhere: grey levels end at {levels.min(2).max()}",
+                    f"some of the photograph to look at, from {_SEEN} on",
                     "Remove the view, or turn the mask over.",
                 )
             shown = seen[..., None].astype(np.uint8)
