@@ -5,7 +5,7 @@ import urllib.request
 from threading import Thread
 
 import pytest
-from cli.commands import fails, run_json
+from cli.commands import fails, run, run_json
 from finetune import tiny
 
 from fragprune_plugins.workbench.figures import records
@@ -35,6 +35,11 @@ def test_a_folder_with_cameras_and_photographs(data, cut, page, tmp_path):
     assert report["truncated"] == [True]
     assert "positions" in report["rounded"]
     assert all("bits" in each for each in held["models"])
+
+
+def test_the_command_that_serves_a_page_is_one_to_copy(cut, tmp_path):
+    out = tmp_path / "my page"
+    assert f'http.server -d "{out}"' in run("view", cut, "--out", out).stdout
 
 
 @pytest.mark.parametrize("name", [".", "index.html"])

@@ -85,7 +85,7 @@ def demo(*, out: Path, iters: int, seed: int, engine: EngineOptions) -> Report:
         f"\n{table}\n\n" + "\n".join(told) + "\n"
         f"Of larger pictures, {larger['size']}: {frames}.\n"
         f"Took {report['seconds']:.0f} s. Open {out / 'index.html'} for the pictures. "
-        f"To turn it: fragprune view {out}"
+        f"To turn it: fragprune view {wording.quoted(out)}"
     )
     return Report(report, text)
 

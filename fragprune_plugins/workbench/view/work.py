@@ -17,6 +17,7 @@ from fragprune_plugins.workbench.commands.opening import drawn_as_trained
 from fragprune_plugins.workbench.commands.options import SceneOptions
 from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.figures.viewing import overview
+from fragprune_plugins.workbench.figures.wording import quoted
 from fragprune_plugins.workbench.models.model import load, writable_folder
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
@@ -79,7 +80,7 @@ def view(
     else:
         sites.save_site(out, site)
         files, what = [str(out / name) for name in sorted(site)], f"{len(site)} files to {out}"
-        then = f"A web server has to serve them; here: python -m http.server -d {out}"
+        then = f"A web server has to serve them; here: python -m http.server -d {quoted(out)}"
     size = sum(map(len, site.values()))
     facts |= {"bytes": size, "files": files, "rounded": rounded}
     how = f", with {', '.join(rounded)} rounded as in a .spz file" if rounded else ""
