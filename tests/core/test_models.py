@@ -65,3 +65,13 @@ def test_a_model_whose_places_are_rounder_than_its_gaussians_is_warned_of(
     write_ply(tmp_path / "m.ply", replace(model, xyz=model.xyz + torch.tensor([0, offset, 0])))
     fp.load(tmp_path / "m.ply")
     assert ("far from the origin" in caplog.text) == warned
+
+
+@pytest.mark.parametrize("activated", [False, True])
+def test_values_that_were_saved_after_activation_are_warned_of(tmp_path, caplog, activated):
+    model = tiny.random_model()
+    if activated:
+        model = replace(model, opacity=model.opacity.sigmoid(), scaling=model.scaling.exp())
+    write_ply(tmp_path / "m.ply", model)
+    fp.load(tmp_path / "m.ply")
+    assert ("saved after activation" in caplog.text) == activated

@@ -87,6 +87,7 @@ def load(
         else:
             if _versions(path) == before:
                 _warn_if_far(path, model)
+                _warn_if_activated(path, model)
                 return model if truncation and model.pruned else model.untruncated()
 
 
@@ -102,6 +103,17 @@ def _warn_if_far(path: Path, model: Model) -> None:
             f"{path}: it lies so far from the origin that float32 has steps of {step:.2g} world "
             f"units there, and half of its Gaussians are no wider than {size:.2g}: its pictures "
             "are wrong by as much. Move the cameras to the origin, and train there"
+        )
+
+
+def _warn_if_activated(path: Path, model: Model) -> None:
+    """Warn of values as a program has them that forgot to undo the activation when it saved."""
+    opacity = model.opacity
+    if bool((opacity >= 0).all() and (opacity <= 1).all() and (model.scaling > 0).all()):
+        _warn(
+            f"{path}: all opacities lie between 0 and 1, and all scales above 0, as if they had "
+            "been saved after activation. They are read as logits and logarithms, as 3DGS saves "
+            "them; save logit(opacity) and log(scale)"
         )
 
 
