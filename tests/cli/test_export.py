@@ -119,3 +119,12 @@ def test_the_model_that_gives_cutoffs_is_not_overwritten(returning, pruned, tmp_
     before = path.read_bytes()
     fails(*returning(pruned), "--out", path, says="the model's name")
     assert path.read_bytes() == before
+
+
+def test_a_file_that_rounds_more_in_a_wide_scene_says_so(path, model, tmp_path):
+    """24 bits hold 1/4096 of a unit up to 2,048 units; one Gaussian beyond takes a bit from all."""
+    model.xyz[0] = 3000
+    write_ply(path, model)
+    out = tmp_path / "out.spz"
+    assert "(less if one is beyond 2,048)" in run("export", path, "--out", out).stdout
+    assert float((fp.load(out).xyz[1:] * 2048).frac().abs().max()) == 0

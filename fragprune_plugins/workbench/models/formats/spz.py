@@ -238,6 +238,6 @@ FORMAT = Format(
     read,
     write,
     thresholds="to 8 bits",
-    keeps="positions to 1/4096 of a unit, scales, opacities and colours to 8 bits, rotations "
-    "to 9 bits and sign, SH to 5 bits (degree 1) and 4 bits",
+    keeps="positions to 1/4096 of a unit (less if one is beyond 2,048), scales, opacities and "
+    "colours to 8 bits, rotations to 9 bits and sign, SH to 5 bits (degree 1) and 4 bits",
 )
