@@ -180,3 +180,10 @@ def test_a_training_that_nothing_serves_is_named_and_runs(tmp_path, caplog):
     script = script_of(tmp_path, "loss.backward()", "train_features.py")
     assert not started._is_served([str(script)])
     assert "train_features.py runs as it is, unpruned" in caplog.text
+
+
+def test_what_is_no_script_of_a_host_costs_little():
+    """Torch alone takes 3 s, and a script may start many."""
+    code = "import sys, fragprune_plugins.workbench.run.started; print('torch' in sys.modules)"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert said.stdout == "False\n"

@@ -8,7 +8,7 @@ from fragprune_plugins.hosts.choosing import attempt
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.workbench.check.work import judge
-from fragprune_plugins.workbench.run.afterwards import unserved
+from fragprune_plugins.workbench.run.unserved import unserved
 
 MODEL = """
     def setup_functions(self):

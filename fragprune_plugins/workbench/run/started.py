@@ -10,6 +10,7 @@ import os
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 from filelock import FileLock
 
@@ -18,10 +19,9 @@ from fragprune_plugins.hosts.choosing import locate
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.command import split
 from fragprune_plugins.plugins.loading import installed
-from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.run import command
-from fragprune_plugins.workbench.run.afterwards import unserved
 from fragprune_plugins.workbench.run.sweep import OPTIONS, STOPPED, is_sweep
+from fragprune_plugins.workbench.run.unserved import unserved
 
 
 def main(folder: Path, words: list[str]) -> None:
@@ -33,7 +33,7 @@ def main(folder: Path, words: list[str]) -> None:
     if not _is_served(words):
         os.execv(sys.executable, [sys.executable, *words])
     options = json.loads((folder / OPTIONS).read_text())
-    began, reports, code = time.time_ns(), list[Report](), 1
+    began, reports, code = time.time_ns(), list[Any](), 1
     with FileLock(folder / f"{began}-{os.getpid()}.lock"):
         if (folder / STOPPED).exists():
             sys.exit(130)

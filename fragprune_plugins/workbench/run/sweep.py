@@ -41,6 +41,11 @@ _PAST = re.compile(
     r"|\b(torchrun|accelerate launch|torch\.distributed)\b"
 )
 """What starts or finds another ``python`` than the first of the PATH."""
+_SHIM = """#!/bin/sh
+case "${{1:--}}" in -|-c|-V|--version) exec {python} "$@" ;; esac
+exec {ours} "$@"
+"""
+"""It tells some of what is no script of a host at no cost."""
 _SINGLY = "Put fragprune run -- in front of each training."
 
 
@@ -135,7 +140,7 @@ def _shims(folder: Path, options: Sequence[str]) -> Path:
     shims = folder / "bin"
     shims.mkdir()
     words = [sys.executable, "-m", "fragprune_plugins.workbench.run.started", str(folder)]
-    text = f'#!/bin/sh\nexec {shlex.join(words)} "$@"\n'
+    text = _SHIM.format(python=shlex.quote(sys.executable), ours=shlex.join(words))
     major, minor = sys.version_info[:2]
     for name in ("python", f"python{major}", f"python{major}.{minor}"):
         (shims / name).write_text(text)
