@@ -94,40 +94,37 @@ class HostCommand:
         return out
 
 
-def split(command: list[str]) -> tuple[Path, list[str], str]:
+def split(command: list[str], *, quietly: bool = False) -> tuple[Path, list[str], str]:
     """(script, arguments, module) of a command; a leading interpreter is dropped.
 
     ``module`` is "" unless the command is ``python -m module``.
     """
     words = list(command)
     if words and Path(words[0]).name.startswith("python"):
-        words = _without_options(words[1:])
+        words = _without_options(words[1:], quietly=quietly)
     if words[:1] == ["-m"] and len(words) > 1:
         return _script_of(words[1]), words[2:], words[1]
     for entry in entry_points(group="console_scripts", name=words[0]) if words else ():
         return _script_of(entry.module), words[1:], entry.module  # as pip installed the command
     if not words or not words[0].endswith(".py"):
         found = repr(" ".join(command)) if command else "none"
-        expected = (
-            "-- python train.py ... (a script of the host), or -- python -m package.module ..."
-        )
+        expected = "-- python train.py ... (the host's script), or -- python -m package.module ..."
         remedy = "Put the host's own training command after --, and what sets variables or starts "
         raise UsageError("command", found, expected, f"{remedy}programs in front of fragprune.")
     script = Path(words[0]).resolve()
     if not script.is_file():
-        raise UsageError(
-            str(script), "no such file", "the host's training script", "Check the path."
-        )
+        remedy = "Check the path."
+        raise UsageError(str(script), "no such file", "the host's training script", remedy)
     return script, words[1:], ""
 
 
-def _without_options(words: list[str]) -> list[str]:
+def _without_options(words: list[str], *, quietly: bool) -> list[str]:
     """The words after the interpreter's own options, such as ``-u`` and ``-X dev``."""
     rest = list(words)
     while rest and _OPTION.fullmatch(rest[0]):
         if rest.pop(0) in ("-W", "-X"):
             rest = rest[1:]
-    if given := words[: len(words) - len(rest)]:
+    if not quietly and (given := words[: len(words) - len(rest)]):
         log.warning(
             "python %s: has no effect, because the script runs in the interpreter of fragprune",
             " ".join(given),

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fragprune_plugins.errors import AlignmentError
+from fragprune_plugins.errors import AlignmentError, log
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.atomic import staging
 from fragprune_plugins.hosts.adapter import CHECKPOINT_KEY, optimizer_state
@@ -52,6 +52,9 @@ def on_load(session: SessionState, call: SeamCall) -> Any:
     path = Path(call.how(call.first))
     if not session.load(call.model, path):
         session.models.pop(call.model, None)  # the model now has other Gaussians
+        others = [each for each in path.parent.parent.glob(f"*/{path.name}") if sidecar.find(each)]
+        if others and not session.learn:  # a render.py --iteration 30000
+            log.warning("%s has no cutoffs. %s has, the pruned model.", path, max(others))
     return result
 
 

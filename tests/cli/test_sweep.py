@@ -3,6 +3,7 @@
 import json
 import os
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -42,18 +43,21 @@ def test_each_script_of_a_host_is_served_and_other_python_is_python(
     lines = [
         f"cd {HOST}  # or conda activate",
         f"A=1 {shlex.join(map(str, [*train, *TINY]))}",
+        f"python render.py -m {tmp_path}/out --iteration 10 2> {tmp_path}/hidden",
         "python3 train.py --nonsense",
         f"python {tmp_path}/plain.py > {tmp_path}/said",
         "python -c 'import sys; sys.exit(7)'",
     ]
     script = script_of(tmp_path, "\n".join(lines))
     monkeypatch.chdir(tmp_path)
-    words = ["--config", "quick.toml", "--json", "--device", "cpu", "--", "bash", script]
+    words = ["--config=quick.toml", "--json", "--device", "cpu", "--", "bash", script]
     result = run("run", *words)
     assert result.exit_code == 7, result.stderr
     assert (tmp_path / "said").read_text() == "False\n"
     data = json.loads(result.stdout)
-    served, failed = data["runs"]
+    served, drawn, failed = data["runs"]
+    assert "the pruned model" in drawn["warnings"][0]
+    assert served["report"]["model_after"] in drawn["warnings"][0]
     assert data["exit_code"] == 7
     assert (served["exit_code"], served["report"]["iterations"]) == (0, 4)
     assert sidecar.find(Path(served["report"]["model_after"]))
@@ -72,24 +76,58 @@ def test_a_training_that_fails_fails_the_sweep(tmp_path, monkeypatch):
     assert "0 of 1 commands of a host ended well." in result.stdout
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "code", "end"),
+    [(signal.SIGINT, 130, ""), (signal.SIGINT, 130, " & wait"), (signal.SIGTERM, 143, " & wait")],
+)
 def test_a_signal_ends_what_was_started_and_nothing_more_starts(
-    number, code, fork, photographs, tmp_path
+    number, code, end, fork, photographs, tmp_path
 ):
+    """A shell has its background ignore Ctrl-C."""
     root = fork(root=tmp_path / "fork").root
     training = TRAINING.format(model="none", code=0, shown="").replace("import os", WAITING, 1)
     (root / "train.py").write_text(training)
     started_ = f"python {root}/train.py -s {photographs} -m {tmp_path}/out\n"
-    script = script_of(tmp_path, f"{started_}touch {tmp_path}/after\n{started_}")
+    inner = script_of(tmp_path, f"{started_}touch {tmp_path}/after\n{started_}", "inner.sh")
+    lines = f"sleep 60 &\npython -c 'import time; time.sleep(60)' &\nsh {inner}{end}\n"
+    script = script_of(tmp_path, f"{lines}touch {tmp_path}/after\n{started_}")
     line = [sys.executable, "-m", "fragprune_plugins", "run", "--device", "cpu", "--", "sh", script]
     how = {"stdout": subprocess.PIPE, "text": True, "start_new_session": True}
     with subprocess.Popen(list(map(str, line)), **how, preexec_fn=hear_ctrl_c) as run_:
         pid = int(run_.stdout.readline())
         run_.send_signal(number)
         assert run_.wait(60) == code
+        assert not run_.stdout.read()  # nobody is left who holds it
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
     assert not (tmp_path / "after").exists()
+
+
+def test_what_is_left_in_the_background_is_waited_for_and_a_killed_one_is_told(
+    photographs, tmp_path
+):
+    """Within a sweep in a sweep: a script of Python starts one of the shell."""
+    root = shutil.copytree(HOST, tmp_path / "host")
+    killed = "import os, time\ntime.sleep(1)\nos.kill(os.getpid(), 9)\n"
+    (root / "train.py").write_text(killed + (HOST / "train.py").read_text())
+    inner = f"import os\nos.system('cd {root} && python -u train.py -s {photographs} -m b &')\n"
+    script_of(tmp_path, inner, "all.py")
+    script = script_of(tmp_path, f"python {tmp_path}/all.py\n")
+    result = run("run", "--device", "cpu", "--", script)
+    assert result.exit_code == 1, result.stderr
+    assert "\n    was killed\n" in result.stdout, result.stdout
+
+
+def test_a_temporary_folder_may_forbid_programs(tmp_path, monkeypatch):
+    monkeypatch.setattr("os.access", lambda path, mode: mode != os.X_OK)
+    script = script_of(tmp_path, "python train.py")
+    fails("run", "--", script, says="Set TMPDIR", code=2)
+
+
+def test_options_of_the_interpreter_are_lost_only_where_it_is_ours(tmp_path, caplog):
+    script = script_of(tmp_path, "print(1)", "plain.py")
+    assert not started._is_served(["-u", str(script)])
+    assert not caplog.text
 
 
 def test_a_script_that_starts_no_training_fails(tmp_path):
@@ -106,6 +144,8 @@ def test_a_script_that_starts_no_training_fails(tmp_path):
         "/opt/gs/bin/python train.py",
         "torchrun --nproc-per-node 2 train.py",
         "python -m torch.distributed.run train.py",
+        "env -i python train.py",
+        'export PATH="$ENV/bin:$PATH"',
     ],
 )
 def test_what_would_start_another_python_is_refused_before_anything(line, tmp_path):

@@ -6,21 +6,24 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
+import signal
 import sys
 import time
+from logging.handlers import MemoryHandler
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock
-
 from fragprune_plugins.errors import FragpruneError, UnknownHostError, UsageError, log
+from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.hosts.choosing import locate
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.command import split
 from fragprune_plugins.plugins.loading import installed
+from fragprune_plugins.workbench.figures.records import strict
 from fragprune_plugins.workbench.run import command
-from fragprune_plugins.workbench.run.sweep import OPTIONS, STOPPED, is_sweep
+from fragprune_plugins.workbench.run.sweep import HELD, OPTIONS, STOPPED, is_sweep
 from fragprune_plugins.workbench.run.unserved import unserved
 
 
@@ -30,29 +33,42 @@ def main(folder: Path, words: list[str]) -> None:
     Args:
         folder: of the sweep; its options lie there.
     """
+    logging.basicConfig(level=logging.INFO, format="fragprune: %(message)s", stream=sys.stderr)
     if not _is_served(words):
         os.execv(sys.executable, [sys.executable, *words])
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's & has it ignored
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # it ends the shells around, not what saves
     options = json.loads((folder / OPTIONS).read_text())
-    began, reports, code = time.time_ns(), list[Any](), 1
-    with FileLock(folder / f"{began}-{os.getpid()}.lock"):
-        if (folder / STOPPED).exists():
-            sys.exit(130)
-        try:
-            command.main([*options, "--", "python", *words], prog_name="fragprune run", obj=reports)
-        except SystemExit as end:
-            code = int(end.code or 0)
-            raise
-        finally:
-            data = reports[0].data if reports else None
-            done = {"command": words, "exit_code": code, "report": data}
-            (folder / f"run-{began}.json").write_text(json.dumps(done))
+    reports, warned = list[Any](), MemoryHandler(1000, logging.CRITICAL)  # stderr may go anywhere
+    warned.setLevel(logging.WARNING)
+    done = {"command": words, "pid": os.getpid(), "exit_code": None, "report": None}
+    result = folder / f"run-{time.time_ns()}-{os.getpid()}.json"
+    _write(result, done)
+    if (folder / STOPPED).exists():
+        sys.exit(130)
+    log.addHandler(warned)
+    done["exit_code"] = 1
+    try:
+        command.main([*options, "--", "python", *words], prog_name="fragprune run", obj=reports)
+    except SystemExit as end:
+        done["exit_code"] = int(end.code or 0)
+        raise
+    finally:
+        done["report"] = reports[0].data if reports else None
+        done["warnings"] = [each.getMessage() for each in warned.buffer]
+        _write(result, done)
+
+
+def _write(path: Path, data: dict[str, Any]) -> None:
+    with replacing(path) as whole:
+        whole.write_text(json.dumps(strict(data)))
 
 
 def _is_served(words: list[str]) -> bool:
     """Whether ``fragprune run`` serves a script: a host's, or one that starts such."""
     try:
-        script, _, _ = split(["python", *words])
-        if is_sweep(words):
+        script, _, _ = split(["python", *words], quietly=True)
+        if is_sweep(["python", *words]):
             return True
         locate(HostRepo(script.parent), installed().adapters)
     except UsageError:  # no script: -c, or a module of the standard library
@@ -69,4 +85,5 @@ def _is_served(words: list[str]) -> bool:
 
 
 if __name__ == "__main__":
+    os.set_inheritable(HELD, False)
     main(Path(sys.argv[1]), sys.argv[2:])

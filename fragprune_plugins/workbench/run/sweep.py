@@ -18,11 +18,10 @@ import stat
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
-
-from filelock import FileLock
 
 from fragprune_plugins.errors import HostFailed, UsageError, log
 from fragprune_plugins.hosts.source import HostRepo
@@ -32,17 +31,22 @@ from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.figures import wording
 
 OPTIONS = "options.json"
-STOPPED = "stopped"
+STOPPED, RUNNING = "stopped", "running"
+HELD = 9
+"""What is started holds the pipe RUNNING open by this number, until it ends."""
 
 _SHELLS = {"sh", "bash", "zsh", "dash", "ksh"}
+_BEGINS = 0.5  # seconds; what a shell left behind with & may not hold the pipe yet
 _STARTING = {"system", "popen", "Popen", "run", "call", "check_call", "check_output"}
 _PAST = re.compile(
     r"\bactivate\b|sys\.executable|\b(conda|mamba|uv|poetry|pipenv) run\b|/python[\d.]*\s+\S+\.py"
-    r"|\b(torchrun|accelerate launch|torch\.distributed)\b"
+    r"|\b(torchrun|accelerate launch|torch\.distributed|env -i)\b"
+    r"|(?<!\w)PATH=[\"']?(?!\$\{?PATH\b|\S*cuda)"
 )
 """What starts or finds another ``python`` than the first of the PATH."""
 _SHIM = """#!/bin/sh
-case "${{1:--}}" in -|-c|-V|--version) exec {python} "$@" ;; esac
+exec 9<>{pipe}
+case "${{1:--}}" in -|-c|-V|--version) exec {python} "$@" 9>&- ;; esac
 exec {ours} "$@"
 """
 """It tells some of what is no script of a host at no cost."""
@@ -63,7 +67,7 @@ def is_sweep(command: Sequence[str]) -> bool:
                 _expect_seen(script, [each.partition("#")[0] for each in text.splitlines()])
         return True
     try:
-        script, _, _ = split(list(command))
+        script, _, _ = split(list(command), quietly=True)
     except UsageError:  # told where the command is run
         return False
     started = _started_by(HostRepo(script.parent), script)
@@ -120,8 +124,8 @@ def run_sweep(command: Sequence[str], options: Sequence[str], *, quietly: bool) 
         path = os.pathsep.join([str(_shims(folder, options)), os.environ.get("PATH", os.defpath)])
         log.info("%s: each script of a host that it starts runs as by fragprune run", name)
         code = _ran(words, folder, os.environ | {"PATH": path}, quietly=quietly)
-        runs = [json.loads(each.read_text()) for each in sorted(folder.glob("run-*.json"))]
-    failed = [each for each in runs if each["exit_code"]]
+        runs = _runs(folder)
+    failed = [each for each in runs if each["exit_code"] != 0]
     if not runs:
         found = "it started no script of a host by the word python"
         raise HostFailed(name, found, "trainings that fragprune can serve", _SINGLY)
@@ -140,21 +144,34 @@ def _shims(folder: Path, options: Sequence[str]) -> Path:
     shims = folder / "bin"
     shims.mkdir()
     words = [sys.executable, "-m", "fragprune_plugins.workbench.run.started", str(folder)]
-    text = _SHIM.format(python=shlex.quote(sys.executable), ours=shlex.join(words))
+    text = _SHIM.format(
+        pipe=shlex.quote(str(folder / RUNNING)),
+        python=shlex.quote(sys.executable),
+        ours=shlex.join(words),
+    )
     major, minor = sys.version_info[:2]
     for name in ("python", f"python{major}", f"python{major}.{minor}"):
         (shims / name).write_text(text)
         (shims / name).chmod(stat.S_IRWXU)
+    if not os.access(shims / "python", os.X_OK):
+        found = "a folder in which nothing can be executed"
+        raise UsageError(str(shims), found, "one in which a script can", "Set TMPDIR to another.")
     return shims
 
 
 def _anywhere(word: str) -> str:
     """A word that names a file, such as that of --config, so that it does in every folder."""
-    return str(Path(word).resolve()) if Path(word).is_file() else word
+    option, equals, value = word.rpartition("=")
+    return f"{option}{equals}{Path(value).resolve()}" if Path(value).is_file() else word
 
 
 def _ran(words: list[str], folder: Path, environment: dict[str, str], *, quietly: bool) -> int:
-    """The exit code of the script; a signal ends it first, and is then heard by what it started."""
+    """The exit code of the script, once all that it started has ended.
+
+    A signal ends the script first, and is then heard by what is served.
+    """
+    os.mkfifo(folder / RUNNING)
+    running = os.open(folder / RUNNING, os.O_RDONLY | os.O_NONBLOCK)
     with (
         sigterm_interrupts(),
         subprocess.Popen(
@@ -162,27 +179,55 @@ def _ran(words: list[str], folder: Path, environment: dict[str, str], *, quietly
         ) as script,
     ):
         try:
-            return script.wait()
+            code = script.wait()
+            time.sleep(_BEGINS)
+            _wait(running)
         except KeyboardInterrupt as interrupt:
             (folder / STOPPED).touch()
             script.kill()  # a shell would go on with its next line
-            heard = signal.SIGTERM if isinstance(interrupt, Terminate) else signal.SIGINT
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(script.pid, heard)
-            for lock in folder.glob("*.lock"):  # they save what they have learned
-                FileLock(lock).acquire()
+            _send(os.killpg, script.pid, signal.SIGHUP)  # so would those inside
+            if isinstance(interrupt, Terminate):  # their workers end with them
+                for run in (each for each in _runs(folder) if each["exit_code"] is None):
+                    _send(os.kill, run["pid"], signal.SIGTERM)
+            else:
+                _send(os.killpg, script.pid, signal.SIGINT)
+            try:
+                _wait(running)  # they save what they have learned
+            finally:
+                _send(os.killpg, script.pid, signal.SIGKILL)
             raise
+    return code if code >= 0 else 128 - code
+
+
+def _wait(running: int) -> None:
+    """Wait until nothing holds the pipe."""
+    os.set_blocking(running, True)
+    os.read(running, 1)
+
+
+def _send(by: Callable[[int, int], None], pid: int, number: int) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        by(pid, number)
+
+
+def _runs(folder: Path) -> list[dict[str, Any]]:
+    """What was served, in the order in which it began."""
+    return [json.loads(each.read_text()) for each in sorted(folder.glob("run-*.json"))]
 
 
 def _line(run: dict[str, Any]) -> str:
     """What became of a script that was served."""
     data: dict[str, Any] = run["report"] or {}
-    said = f"python {shlex.join(run['command'])}"
-    if run["exit_code"]:
-        return f"{said}\n  ended with exit code {run['exit_code']}"
-    if not data.get("before"):
-        return f"{said}\n  {data.get('model_after') or 'trained nothing'}"
-    gained = wording.outcome("run", data, data["control"])
-    if data["control"] is None:
-        gained = f"{wording.gain(data['before'], data['after'])}."
-    return f"{said}\n  {gained}\n  {data['model_after']}"
+    said = [f"python {shlex.join(run['command'])}"]
+    if run["exit_code"] != 0:
+        code = run["exit_code"]
+        said.append("was killed" if code is None else f"ended with exit code {code}")
+    elif data.get("before"):
+        gained = wording.outcome("run", data, data["control"])
+        said.append(
+            gained if data["control"] else f"{wording.gain(data['before'], data['after'])}."
+        )
+    said += [data["model_after"]] if data.get("model_after") else []
+    said += [_line(each) for each in data.get("runs", ())]
+    said += run.get("warnings", ())
+    return "\n".join(said).replace("\n", "\n  ")

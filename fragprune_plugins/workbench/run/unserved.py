@@ -73,7 +73,7 @@ class Unserved:
 
 def unserved(command: Sequence[str]) -> Unserved | None:
     """The command, if it trains, no adapter fits its codebase, and that saves plain 3DGS."""
-    script, arguments, module = split(list(command))
+    script, arguments, module = split(list(command), quietly=True)
     here, plugins = HostRepo(script.parent), load_plugins()
     trains = "train" in script.stem or ".backward(" in here.read(script)
     folders = [here, *folder_above(here)] if trains else []
