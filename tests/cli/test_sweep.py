@@ -18,7 +18,8 @@ from miniatures.vanilla_3dgs import HOST
 
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.workbench.run import started
-from fragprune_plugins.workbench.run.sweep import OPTIONS, STOPPED, is_sweep
+from fragprune_plugins.workbench.run.recognising import is_sweep
+from fragprune_plugins.workbench.run.sweep import OPTIONS, STOPPED
 
 FULL_EVAL = """
 import os

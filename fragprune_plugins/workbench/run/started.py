@@ -23,7 +23,8 @@ from fragprune_plugins.injection.command import split
 from fragprune_plugins.plugins.loading import installed
 from fragprune_plugins.workbench.figures.records import strict
 from fragprune_plugins.workbench.run import command
-from fragprune_plugins.workbench.run.sweep import HELD, OPTIONS, STOPPED, is_sweep
+from fragprune_plugins.workbench.run.recognising import is_sweep
+from fragprune_plugins.workbench.run.sweep import HELD, OPTIONS, STOPPED
 from fragprune_plugins.workbench.run.unserved import unserved
 
 

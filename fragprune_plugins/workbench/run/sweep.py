@@ -6,11 +6,9 @@ by runs it as if ``fragprune run`` stood there, with the same options (``started
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import json
 import os
-import re
 import shlex
 import shutil
 import signal
@@ -24,81 +22,23 @@ from pathlib import Path
 from typing import Any
 
 from fragprune_plugins.errors import HostFailed, UsageError, log
-from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.injection.command import split
 from fragprune_plugins.learning.interruption import Terminate, sigterm_interrupts
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.figures import wording
+from fragprune_plugins.workbench.run.recognising import SINGLY
 
 OPTIONS = "options.json"
 STOPPED, RUNNING = "stopped", "running"
 HELD = 9
 """What is started holds the pipe RUNNING open by this number, until it ends."""
 
-_SHELLS = {"sh", "bash", "zsh", "dash", "ksh"}
 _BEGINS = 0.5  # seconds; what a shell left behind with & may not hold the pipe yet
-_STARTING = {"system", "popen", "Popen", "run", "call", "check_call", "check_output"}
-_PAST = re.compile(
-    r"\bactivate\b|sys\.executable|\b(conda|mamba|uv|poetry|pipenv) run\b|/python[\d.]*\s+\S+\.py"
-    r"|\b(torchrun|accelerate launch|torch\.distributed|env -i)\b"
-    r"|(?<!\w)PATH=[\"']?(?!\$\{?PATH\b|\S*cuda)"
-)
-"""What starts or finds another ``python`` than the first of the PATH."""
 _SHIM = """#!/bin/sh
 exec 9<>{pipe}
 case "${{1:--}}" in -|-c|-V|--version) exec {python} "$@" 9>&- ;; esac
 exec {ours} "$@"
 """
 """It tells some of what is no script of a host at no cost."""
-_SINGLY = "Put fragprune run -- in front of each training."
-
-
-def is_sweep(command: Sequence[str]) -> bool:
-    """Whether a command runs a script that trains nothing itself, but starts others that do.
-
-    Raises:
-        UsageError: it does, in a way in which they cannot be served.
-    """
-    name = Path(command[0]).name if command else ""
-    if name in _SHELLS or name.endswith(".sh"):
-        for script in (Path(word) for word in command if word.endswith(".sh")):
-            if script.is_file():
-                text = script.read_text(encoding="utf-8", errors="replace")
-                _expect_seen(script, [each.partition("#")[0] for each in text.splitlines()])
-        return True
-    try:
-        script, _, _ = split(list(command), quietly=True)
-    except UsageError:  # told where the command is run
-        return False
-    started = _started_by(HostRepo(script.parent), script)
-    _expect_seen(script, started)
-    return bool(started)
-
-
-def _expect_seen(script: Path, lines: Sequence[str]) -> None:
-    """Refuse a script that would not find our ``python``."""
-    for line in lines:
-        if _PAST.search(line):
-            raise UsageError(
-                str(script),
-                f"{line.strip()!r}, which starts a python that fragprune does not see",
-                "the word python alone, in an environment that is active already",
-                f"Take that out, or: {_SINGLY}",
-            )
-
-
-def _started_by(here: HostRepo, script: Path) -> list[str]:
-    """What a Python script starts, if a training is among it and it trains nothing itself."""
-    text, tree = here.read(script), here.tree(script.stem)
-    if ".backward(" in text or tree is None:
-        return []
-    nodes = list(ast.walk(tree))
-    calls = {getattr(each.func, "attr", "") for each in nodes if isinstance(each, ast.Call)}
-    said = [each.value for each in nodes if isinstance(each, ast.Constant)]
-    named = [each for each in said if isinstance(each, str) and re.search(r"\w\.py\b", each)]
-    if not (calls & _STARTING and any(re.search(r"train\w*\.py\b", each) for each in named)):
-        return []
-    return named + re.findall("sys.executable", text)
 
 
 def run_sweep(command: Sequence[str], options: Sequence[str], *, quietly: bool) -> Report:
@@ -114,7 +54,7 @@ def run_sweep(command: Sequence[str], options: Sequence[str], *, quietly: bool) 
     """
     words, name = list(command), shlex.join(command)
     if os.name != "posix":
-        raise UsageError(name, os.name, "Linux or macOS, for a script of trainings", _SINGLY)
+        raise UsageError(name, os.name, "Linux or macOS, for a script of trainings", SINGLY)
     if words[0].endswith((".py", ".sh")):
         words.insert(0, "python" if words[0].endswith(".py") else shutil.which("bash") or "sh")
     if Path(words[0]).name.startswith("python"):
@@ -128,7 +68,7 @@ def run_sweep(command: Sequence[str], options: Sequence[str], *, quietly: bool) 
     failed = [each for each in runs if each["exit_code"] != 0]
     if not runs:
         found = "it started no script of a host by the word python"
-        raise HostFailed(name, found, "trainings that fragprune can serve", _SINGLY)
+        raise HostFailed(name, found, "trainings that fragprune can serve", SINGLY)
     lines = [_line(each) for each in runs]
     lines.append(f"{len(runs) - len(failed)} of {len(runs)} commands of a host ended well.")
     if code:

@@ -45,7 +45,8 @@ from fragprune_plugins.workbench.finetune.trial import Trial, tried
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.pruning import kept
 from fragprune_plugins.workbench.run.afterwards import train_then_finetune
-from fragprune_plugins.workbench.run.sweep import is_sweep, run_sweep
+from fragprune_plugins.workbench.run.recognising import is_sweep
+from fragprune_plugins.workbench.run.sweep import run_sweep
 from fragprune_plugins.workbench.run.unserved import Unserved, unserved
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
 from fragprune_plugins.workbench.scenes.generated import views_near
