@@ -17,7 +17,7 @@ from miniatures.runs import TINY
 from miniatures.vanilla_3dgs import HOST
 
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.workbench.run import started
+from fragprune_plugins.workbench.run import started, sweep
 from fragprune_plugins.workbench.run.recognising import is_sweep
 from fragprune_plugins.workbench.run.sweep import OPTIONS, STOPPED
 
@@ -217,10 +217,20 @@ def test_scripts_of_hosts_are_served(words, served, tmp_path, monkeypatch):
     assert taken == ([] if served else [[sys.executable, *map(str, words)]])
 
 
-def test_a_training_that_nothing_serves_is_named_and_runs(tmp_path, caplog):
+def test_a_training_that_nothing_serves_is_named_and_runs(tmp_path, monkeypatch):
+    """Also at the end: what it prints may go to a file."""
+    monkeypatch.setattr(started.os, "execv", lambda *_: sys.exit(0))
     script = script_of(tmp_path, "loss.backward()", "train_features.py")
-    assert not started._is_served([str(script)])
-    assert "train_features.py runs as it is, unpruned" in caplog.text
+    with pytest.raises(SystemExit):
+        started.main(tmp_path, [str(script)])
+    (run,) = sweep._runs(tmp_path)
+    assert "train_features.py runs as it is, unpruned" in sweep._line(run)
+
+
+def test_what_a_codebase_without_an_adapter_renders_is_not_pruned():
+    report = {"adapter": None, "model_before": "point_cloud.ply", "model_after": "pruned.ply"}
+    run = {"command": ["train.py"], "exit_code": 0, "report": report, "warnings": []}
+    assert "draws point_cloud.ply, which is not pruned" in sweep._line(run)
 
 
 def test_what_is_no_script_of_a_host_costs_little():

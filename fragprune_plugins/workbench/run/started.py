@@ -35,19 +35,22 @@ def main(folder: Path, words: list[str]) -> None:
         folder: of the sweep; its options lie there.
     """
     logging.basicConfig(level=logging.INFO, format="fragprune: %(message)s", stream=sys.stderr)
+    warned = MemoryHandler(1000, logging.CRITICAL)  # stderr may go anywhere
+    warned.setLevel(logging.WARNING)
+    log.addHandler(warned)
+    result = folder / f"run-{time.time_ns()}-{os.getpid()}.json"
+    done = {"command": words, "pid": None, "exit_code": 0, "report": None}
     if not _is_served(words):
+        if warned.buffer:
+            _write(result, done, warned)
         os.execv(sys.executable, [sys.executable, *words])
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's & has it ignored
     signal.signal(signal.SIGHUP, signal.SIG_IGN)  # it ends the shells around, not what saves
-    options = json.loads((folder / OPTIONS).read_text())
-    reports, warned = list[Any](), MemoryHandler(1000, logging.CRITICAL)  # stderr may go anywhere
-    warned.setLevel(logging.WARNING)
-    done = {"command": words, "pid": os.getpid(), "exit_code": None, "report": None}
-    result = folder / f"run-{time.time_ns()}-{os.getpid()}.json"
-    _write(result, done)
+    options, reports = json.loads((folder / OPTIONS).read_text()), list[Any]()
+    done |= {"pid": os.getpid(), "exit_code": None}
+    _write(result, done, warned)
     if (folder / STOPPED).exists():
         sys.exit(130)
-    log.addHandler(warned)
     done["exit_code"] = 1
     try:
         command.main([*options, "--", "python", *words], prog_name="fragprune run", obj=reports)
@@ -56,13 +59,13 @@ def main(folder: Path, words: list[str]) -> None:
         raise
     finally:
         done["report"] = reports[0].data if reports else None
-        done["warnings"] = [each.getMessage() for each in warned.buffer]
-        _write(result, done)
+        _write(result, done, warned)
 
 
-def _write(path: Path, data: dict[str, Any]) -> None:
+def _write(path: Path, done: dict[str, Any], warned: MemoryHandler) -> None:
+    said = list(dict.fromkeys(each.getMessage() for each in warned.buffer))
     with replacing(path) as whole:
-        whole.write_text(json.dumps(strict(data)))
+        whole.write_text(json.dumps(strict(done | {"warnings": said})))
 
 
 def _is_served(words: list[str]) -> bool:

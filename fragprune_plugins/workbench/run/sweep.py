@@ -65,12 +65,13 @@ def run_sweep(command: Sequence[str], options: Sequence[str], *, quietly: bool) 
         log.info("%s: each script of a host that it starts runs as by fragprune run", name)
         code = _ran(words, folder, os.environ | {"PATH": path}, quietly=quietly)
         runs = _runs(folder)
-    failed = [each for each in runs if each["exit_code"] != 0]
-    if not runs:
+    served = [each for each in runs if each["pid"]]
+    failed = [each for each in served if each["exit_code"] != 0]
+    if not served:
         found = "it started no script of a host by the word python"
         raise HostFailed(name, found, "trainings that fragprune can serve", SINGLY)
     lines = [_line(each) for each in runs]
-    lines.append(f"{len(runs) - len(failed)} of {len(runs)} commands of a host ended well.")
+    lines.append(f"{len(served) - len(failed)} of {len(served)} commands of a host ended well.")
     if code:
         lines.append(f"{name}: ended with exit code {code}.")
     return Report({"runs": runs, "exit_code": code}, "\n".join(lines), code or int(bool(failed)))
@@ -168,6 +169,8 @@ def _line(run: dict[str, Any]) -> str:
             gained if data["control"] else f"{wording.gain(data['before'], data['after'])}."
         )
     said += [data["model_after"]] if data.get("model_after") else []
+    if data.get("adapter", "") is None:  # its render.py is not served
+        said.append(f"The codebase itself draws {data['model_before']}, which is not pruned.")
     said += [_line(each) for each in data.get("runs", ())]
-    said += run.get("warnings", ())
+    said += run["warnings"]
     return "\n".join(said).replace("\n", "\n  ")
