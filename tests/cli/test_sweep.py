@@ -44,8 +44,7 @@ def test_each_script_of_a_host_is_served_and_other_python_is_python(
     lines = [
         f"cd {HOST}  # or conda activate",
         f"A=1 {shlex.join(map(str, [*train, *TINY]))}",
-        f"python render.py -m {tmp_path}/out --iteration 10 2> {tmp_path}/hidden",
-        "python3 train.py --nonsense",
+        f"python3 render.py -m {tmp_path}/out --iteration 10 2> {tmp_path}/hidden",
         f"python {tmp_path}/plain.py > {tmp_path}/said",
         "python -c 'import sys; sys.exit(7)'",
     ]
@@ -56,14 +55,12 @@ def test_each_script_of_a_host_is_served_and_other_python_is_python(
     assert result.exit_code == 7, result.stderr
     assert (tmp_path / "said").read_text() == "False\n"
     data = json.loads(result.stdout)
-    served, drawn, failed = data["runs"]
+    served, drawn = data["runs"]
     assert "the pruned model" in drawn["warnings"][0]
     assert served["report"]["model_after"] in drawn["warnings"][0]
     assert data["exit_code"] == 7
     assert (served["exit_code"], served["report"]["iterations"]) == (0, 4)
     assert sidecar.find(Path(served["report"]["model_after"]))
-    assert (failed["command"], failed["report"]) == (["train.py", "--nonsense"], None)
-    assert failed["exit_code"] != 0
     assert "fewer fragments" not in capfd.readouterr().out  # stdout has the object alone
 
 
@@ -77,12 +74,9 @@ def test_a_training_that_fails_fails_the_sweep(tmp_path, monkeypatch):
     assert "0 of 1 commands of a host ended well." in result.stdout
 
 
-@pytest.mark.parametrize(
-    ("number", "code", "end"),
-    [(signal.SIGINT, 130, ""), (signal.SIGINT, 130, " & wait"), (signal.SIGTERM, 143, " & wait")],
-)
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_ends_what_was_started_and_nothing_more_starts(
-    number, code, end, fork, photographs, tmp_path
+    number, code, fork, photographs, tmp_path
 ):
     """A shell has its background ignore Ctrl-C."""
     root = fork(root=tmp_path / "fork").root
@@ -90,7 +84,7 @@ def test_a_signal_ends_what_was_started_and_nothing_more_starts(
     (root / "train.py").write_text(training)
     started_ = f"python {root}/train.py -s {photographs} -m {tmp_path}/out\n"
     inner = script_of(tmp_path, f"{started_}touch {tmp_path}/after\n{started_}", "inner.sh")
-    lines = f"sleep 60 &\npython -c 'import time; time.sleep(60)' &\nsh {inner}{end}\n"
+    lines = f"sleep 60 &\npython -c 'import time; time.sleep(60)' &\nsh {inner} & wait\n"
     script = script_of(tmp_path, f"{lines}touch {tmp_path}/after\n{started_}")
     line = [sys.executable, "-m", "fragprune_plugins", "run", "--device", "cpu", "--", "sh", script]
     how = {"stdout": subprocess.PIPE, "text": True, "start_new_session": True}
