@@ -168,6 +168,8 @@ def test_so_is_it_in_a_script_of_python(old, new, found, tmp_path):
         ("os.system", "print", False),
         ("train.py", "render.py", False),
         ("import os", "import os\nloss.backward()", False),
+        ("import os", "import os\nfrom scene import GaussianModel", False),  # it draws itself
+        ('" + scene', '" + scene + " MODEL.PATH=out"', True),
     ],
 )
 def test_a_sweep_starts_trainings_and_trains_nothing(old, new, expected, tmp_path):
