@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fragprune_plugins.constants import NEUTRAL_LOGIT
 from fragprune_plugins.errors import ModelFileError, log
 from fragprune_plugins.files.columns import change_of, is_plain
 from fragprune_plugins.files.model import REST_COUNTS, Model
@@ -250,4 +249,4 @@ def _store_of(path: Path, values: Tensor) -> ThresholdStore:
         remedy = "Export the model again with fragprune export."
         raise ModelFileError(str(path), found, "falloff thresholds", remedy)
     # Whoever merges a pruned model with another fills the column with 0.
-    return ThresholdStore.from_falloff(values.where(values > 0, math.exp(NEUTRAL_LOGIT)))
+    return ThresholdStore.from_falloff(values.clamp_min(1e-30))  # neutral, too

@@ -25,11 +25,11 @@ LAZY = (  # by name: in adapting.__getattr__, in engines.ENGINES
 
 # figure: (bound, goal)
 BOUNDS = {
-    "core lines": (11_476, 12_000),
+    "core lines": (11_475, 12_000),
     "core imports of the workbench": (0, 0),
     "imports inside functions": (27, 60),
     "functions over 60 lines": (5, 10),
-    "longest function": (72, 80),
+    "longest function": (69, 80),
     "members of an adapter": (24, 24),
     "members of a dialect": (7, 7),
     "members with one user": (3, 5),
