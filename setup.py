@@ -58,7 +58,12 @@ if __name__ == "__main__":
     from setuptools.modified import newer_group
 
     class Libraries(build_ext):
-        """Builds files named as the loader opens them."""
+        """Builds files named as the loader opens them, side by side."""
+
+        def initialize_options(self) -> None:
+            """As many at once as there are cores."""
+            super().initialize_options()
+            self.parallel = True
 
         def get_ext_filename(self, fullname: str) -> str:
             """Where a library goes, without the tag of this Python."""
