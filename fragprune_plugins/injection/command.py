@@ -113,8 +113,7 @@ def split(command: list[str], *, quietly: bool = False) -> tuple[Path, list[str]
         raise UsageError("command", found, expected, f"{remedy}programs in front of fragprune.")
     script = Path(words[0]).resolve()
     if not script.is_file():
-        remedy = "Check the path."
-        raise UsageError(str(script), "no such file", "the host's training script", remedy)
+        raise UsageError(str(script), "no such file", "the host's script", "Check the path.")
     return script, words[1:], ""
 
 

@@ -54,7 +54,8 @@ def on_load(session: SessionState, call: SeamCall) -> Any:
         session.models.pop(call.model, None)  # the model now has other Gaussians
         others = [each for each in path.parent.parent.glob(f"*/{path.name}") if sidecar.find(each)]
         if others and not session.learn:  # a render.py --iteration 30000
-            log.warning("%s has no cutoffs. %s has, the pruned model.", path, max(others))
+            newest = max(others, key=lambda each: each.stat().st_mtime)
+            log.warning("%s has no cutoffs. %s has, the pruned model.", path, newest)
     return result
 
 

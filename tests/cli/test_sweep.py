@@ -44,6 +44,9 @@ def test_each_script_of_a_host_is_served_and_other_python_is_python(
     lines = [
         f"cd {HOST}  # or conda activate",
         f"A=1 {shlex.join(map(str, [*train, *TINY]))}",
+        f"mkdir {tmp_path}/out/point_cloud/iteration_9",  # of an earlier run
+        f"cp {tmp_path}/out/point_cloud/iteration_1[1-9]/* {tmp_path}/out/point_cloud/iteration_9",
+        f"touch -d 2000-01-01 {tmp_path}/out/point_cloud/iteration_9/point_cloud.ply",
         f"python3 render.py -m {tmp_path}/out --iteration 10 2> {tmp_path}/hidden",
         f"python {tmp_path}/plain.py > {tmp_path}/said",
         "python -c 'import sys; sys.exit(7)'",
@@ -84,7 +87,7 @@ def test_a_signal_ends_what_was_started_and_nothing_more_starts(
     (root / "train.py").write_text(training)
     started_ = f"python {root}/train.py -s {photographs} -m {tmp_path}/out\n"
     inner = script_of(tmp_path, f"{started_}touch {tmp_path}/after\n{started_}", "inner.sh")
-    lines = f"sleep 60 &\npython -c 'import time; time.sleep(60)' &\nsh {inner} & wait\n"
+    lines = f"nohup sleep 90 &\npython -c 'import time; time.sleep(60)' &\nsh {inner} & wait\n"
     script = script_of(tmp_path, f"{lines}touch {tmp_path}/after\n{started_}")
     line = [sys.executable, "-m", "fragprune_plugins", "run", "--device", "cpu", "--", "sh", script]
     how = {"stdout": subprocess.PIPE, "text": True, "start_new_session": True}
@@ -92,7 +95,7 @@ def test_a_signal_ends_what_was_started_and_nothing_more_starts(
         pid = int(run_.stdout.readline())
         run_.send_signal(number)
         assert run_.wait(60) == code
-        assert not run_.stdout.read()  # nobody is left who holds it
+        assert not run_.communicate(timeout=30)[0]  # nobody is left who holds it
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
     assert not (tmp_path / "after").exists()

@@ -45,7 +45,8 @@ _say = partial(click.echo, err=True)
 OTHER_SCENE = 3.0
 """dB of PSNR that a model has to be above pictures of one colour each, to be one of the scene.
 
-Trained models are by ten or more. A model that was moved is at -6 to 3 in an object's photographs.
+On two scenes trained models are by ten or more; on an object's photographs one that was moved is
+at -6 to 3, or up to 10 if it was moved a little.
 """
 
 

@@ -80,7 +80,7 @@ def run_sweep(command: Sequence[str], options: Sequence[str], *, quietly: bool) 
 def _shims(folder: Path, options: Sequence[str]) -> Path:
     """Write what is found in place of ``python``; returns its folder."""
     (folder / OPTIONS).write_text(
-        json.dumps([_anywhere(each) for each in options if each != "--json"])
+        json.dumps([_anywhere(each) for each in options if each not in ("--", "--json")])
     )
     shims = folder / "bin"
     shims.mkdir()

@@ -82,7 +82,7 @@ def run(
             what = " ".join(host_command)
             raise UsageError("--log", what, "one training, whose steps it writes", "Leave it out.")
         words = context.meta[WORDS]
-        ours = words[: words.index("--") if "--" in words else len(words) - len(host_command)]
+        ours = words[: len(words) - len(host_command)]
         return run_sweep(host_command, ours, quietly=as_json)
     looking = Looking(engine)
     options = launch.RunOptions(
