@@ -17,7 +17,8 @@ from miniatures.runs import TINY
 from miniatures.vanilla_3dgs import HOST
 
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.workbench.run import started, sweep
+from fragprune_plugins.workbench.commands.command import Report
+from fragprune_plugins.workbench.run import started, sweep, work
 from fragprune_plugins.workbench.run.recognising import is_sweep
 from fragprune_plugins.workbench.run.sweep import OPTIONS, STOPPED
 
@@ -179,6 +180,19 @@ def test_a_sweep_starts_trainings_and_trains_nothing(old, new, expected, tmp_pat
     script = script_of(tmp_path, FULL_EVAL.replace(old, new), "all.py")
     assert is_sweep(["python", str(script)]) == expected
     assert is_sweep([str(script), "--scene", "room"]) == expected
+
+
+@pytest.mark.parametrize("between", [(), ("--",)])
+def test_words_behind_the_script_are_its_own(between, tmp_path, monkeypatch):
+    asked = []
+
+    def swept(command, options, **_):
+        asked.append(([*command], [each for each in options if each != "--"]))
+        return Report({}, "")
+
+    monkeypatch.setattr(work, "run_sweep", swept)
+    run("run", "--quick", *between, "all.sh", "--", "room")
+    assert asked == [(["all.sh", "--", "room"], ["--quick"])]
 
 
 def test_a_log_is_of_a_single_training(tmp_path):
