@@ -156,6 +156,17 @@ def test_thresholds_that_a_host_left_behind_are_missed(scene, tmp_path):
     fails("run", *WORDS, *words, says=said, code=1)
 
 
+def test_a_model_that_a_host_takes_away_is_missed(scene, tmp_path):
+    host = shutil.copytree(HOST, tmp_path / "host")
+    with (host / "train.py").open("a") as script:
+        script.write("    from pathlib import Path\n")
+        script.write("    for each in Path(args.model_path).rglob('point_cloud.*'):\n")
+        script.write("        each.unlink()\n")
+    words = command(scene, tmp_path / "out")
+    words[1] = host / "train.py"
+    fails("run", *WORDS, *words, says=("no model was saved", "last iteration"), code=1)
+
+
 @pytest.mark.parametrize("held", [True, False])
 def test_views_that_stage_one_saw_are_not_said_to_be_held_out(scene, tmp_path, held):
     out = tmp_path / "out"

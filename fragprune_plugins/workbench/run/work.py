@@ -136,17 +136,31 @@ def _launched(command: Sequence[str], options: launch.RunOptions) -> launch.RunS
 
 
 def _expect_thresholds(summary: launch.RunSummary, settings: Settings) -> None:
-    """Refuse a model without what stage 2 learned: the host moved or wrote files after it saved."""
-    model = summary.model_after
-    if model is None or model.suffix != ".ply":  # a host's checkpoint holds them itself
+    """Refuse a model without what stage 2 learned: the host moved or wrote files after it saved.
+
+    Where no model was found, its thresholds may lie anywhere in the host's folder.
+    """
+    model, folder = summary.model_after, summary.output
+    if not (summary.steps and settings.goal.learns and folder):
         return
-    if not (summary.steps and settings.goal.learns) or sidecar.find(model):
+    left = sorted(folder.rglob(f"*{sidecar.SUFFIX}"))
+    if model is None:
+        if left or _in_checkpoints(folder):
+            return
+        found = "no model was saved when stage 2 had ended"
+        remedy = "Have the host save its model at its last iteration, and run it again."
+    elif model.suffix != ".ply" or sidecar.find(model):  # a checkpoint holds them itself
         return
-    left = sorted(summary.output.rglob(f"*{sidecar.SUFFIX}")) if summary.output else []
-    found = f"{sidecar.path_beside(model).name} is not beside it"
-    found += f"; in the folder there is {left[-1]}" if left else ""
-    remedy = "Look where the host moved the model that it saved, and move the thresholds there."
-    raise SidecarError(str(model), found, "the thresholds that were learned", remedy)
+    else:
+        found = f"{sidecar.path_beside(model).name} is not beside it"
+        found += f"; in the folder there is {left[-1]}" if left else ""
+        remedy = "Look where the host moved the model that it saved, and move the thresholds there."
+    raise SidecarError(str(model or folder), found, "the thresholds that were learned", remedy)
+
+
+def _in_checkpoints(folder: Path) -> bool:
+    """Whether the host keeps models in checkpoints of its own, which hold their thresholds."""
+    return any(folder.glob("*.ckpt"))
 
 
 @contextlib.contextmanager
@@ -215,7 +229,7 @@ def _options(command: Sequence[str]) -> list[str]:
 
 def _saved(summary: launch.RunSummary) -> str:
     """Where a model is that is no PLY."""
-    kept = summary.output is not None and any(summary.output.glob("*.ckpt"))
+    kept = summary.output is not None and _in_checkpoints(summary.output)
     return f"the last checkpoint in {summary.output}" if kept else "not saved by the host"
 
 
