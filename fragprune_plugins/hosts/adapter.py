@@ -291,7 +291,7 @@ class HostAdapter(ABC):
             return [Finding("info", "revision", repo.package, repo.commit)]
         expected = f"the installed package {self.installed[0]}, or a script that imports it"
         remedy = f"Train with: {self.info.usage}" if self.info.usage else ""
-        return [Finding.error("other-host", repo.root, "a folder", expected, remedy)]
+        return [Finding.error("other-host", repo.root, "a folder, not a package", expected, remedy)]
 
     def match(self, repo: HostRepo) -> Match:
         """Check fingerprint and seams. An adapter that raises does not fit."""

@@ -37,7 +37,7 @@ def test_nerfstudio_finds_the_method_and_nobody_else_imports_it(python):
 
 def test_a_folder_is_no_nerfstudio(tmp_path):
     (finding,) = Nerfstudio().fingerprint(HostRepo(tmp_path))
-    assert (finding.level, finding.found) == ("error", "a folder")
+    assert (finding.level, finding.found) == ("error", "a folder, not a package")
     assert METHOD in finding.remedy
 
 

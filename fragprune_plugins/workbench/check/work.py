@@ -343,7 +343,7 @@ def judge(
         return Verdict("inside", sentence, own.reasons[0], name, differs, inside)
     if nearest and nearest.installed and tried[nearest].held == tried[nearest].looked_up:
         package = nearest.installed[0]
-        reason = f"its source is trained with once it is installed, as {package}"
+        reason = f"it is the source of {package}, which is served once it is installed"
         sentence = f"Not here: {reason}. pip install {repo.root}; fragprune check {package}"
         return Verdict("never", sentence, reason, name, differs)
     reason = f"{plain.folder}/: {plain.reasons[0]}" if plain.folder else plain.reasons[0]
