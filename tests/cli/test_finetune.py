@@ -251,6 +251,7 @@ def test_figures_of_a_model_do_not_outlive_it(words, out, monkeypatch):
     assert records.files(out.parent) == []
 
 
+@pytest.mark.usefixtures("ctrl_c")
 def test_an_interrupted_search_quotes_no_control_that_trained_for_longer(words, monkeypatch):
     tiny.at_loss(monkeypatch, 6 + 4, lambda: signal.raise_signal(signal.SIGINT))
     result = run(*words, 6, "--max-drop", 5, "--json")
