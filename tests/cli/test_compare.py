@@ -12,6 +12,7 @@ from PIL import Image
 from fragprune_plugins import RasterInputs, load_cameras, rasterize
 from fragprune_plugins.workbench.figures import evaluate
 from fragprune_plugins.workbench.figures.metrics import psnr
+from fragprune_plugins.workbench.models.formats.arrays import SH_C0
 from fragprune_plugins.workbench.models.formats.ply import write_ply
 
 FIGURES = ("psnr", "ssim", "fragments_per_pixel", "gaussians")
@@ -115,6 +116,29 @@ def test_profile_measures_against_the_models_own_pictures(path, model):
     assert report["target"] == "itself"
     assert report["columns"]["untruncated"]["psnr"] is None
     assert 10 < report["psnr"] < 80
+
+
+def test_a_model_that_shows_other_things_is_told(data, path, model, tmp_path):
+    """Also where dark pictures make its PSNR a high one."""
+    near = tmp_path / "near.ply"
+    write_ply(near, tiny.cut(model, 0.2))
+    assert run_json("compare", path, near, "--data", data)["warnings"] == []
+    assert run_json("profile", near, "--data", data)["warnings"] == []
+    for image in (data / "images").iterdir():
+        with Image.open(image) as picture:
+            picture.point(lambda level: level // 4).save(image)
+    dark, moved = tmp_path / "dark.ply", tmp_path / "moved.ply"
+    colour = (0.5 + SH_C0 * model.f_dc) / 4
+    model = replace(model, f_dc=(colour - 0.5) / SH_C0, f_rest=model.f_rest / 4)
+    write_ply(dark, model)
+    write_ply(moved, replace(model, xyz=model.xyz + torch.tensor([1.0, 0.0, 0.0])))
+    report = run_json("compare", dark, moved, "--data", data)
+    (warning,) = report["warnings"]
+    assert warning.startswith("B hardly shows these pictures")
+    assert report["b"]["psnr"] > 20
+    assert run_json("profile", dark, "--data", data)["warnings"] == []
+    (warning,) = run_json("profile", moved, "--data", data)["warnings"]
+    assert warning.startswith("MODEL hardly shows these pictures")
 
 
 def test_profile_has_a_column_with_thresholds_and_one_without(data, path, model, tmp_path):

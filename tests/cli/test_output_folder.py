@@ -1,7 +1,6 @@
 """A training's output folder in place of a model, and what is known of the training then."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -304,13 +303,3 @@ def test_arguments_that_are_none_are_refused_and_not_executed(output, text, caps
         trained_on(output / "point_cloud" / "iteration_900" / "point_cloud.ply")
     assert capsys.readouterr().out == ""
     assert "memory" not in stated.value.found
-
-
-def test_models_of_different_things_are_told_apart(data, path, model, tmp_path):
-    other = tmp_path / "other.ply"
-    write_ply(other, replace(model, f_dc=-3 * model.f_dc, xyz=model.xyz + 0.5))
-    (warning,) = run_json("compare", path, other, "--data", data)["warnings"]
-    assert warning.startswith("B hardly shows these photographs")
-    near = tmp_path / "near.ply"
-    write_ply(near, tiny.cut(model, 0.2))
-    assert run_json("compare", path, near, "--data", data)["warnings"] == []

@@ -14,7 +14,7 @@ from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
 from fragprune_plugins.workbench.figures import records, wording
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
-from fragprune_plugins.workbench.figures.matching import told_or_matched
+from fragprune_plugins.workbench.figures.matching import hardly_shown, told_or_matched
 from fragprune_plugins.workbench.figures.pictures import leave_panels
 from fragprune_plugins.workbench.models.model import load, writable_folder
 from fragprune_plugins.workbench.scenes.output import trained_on
@@ -70,7 +70,8 @@ def compare(
         "device": before["device"],
         "enlarge": enlarge,
         "scene": records.plain(photographs) if photographs else None,
-        "warnings": wording.nothing_drawn(drawn) + wording.unrelated(before, after),
+        "warnings": wording.nothing_drawn(drawn)
+        + hardly_shown({"A": before["psnr"], "B": after["psnr"]}, shots),
     }
     report["warnings"] += exposures_left_out(a, b) if photographs else []
     lines = _lines(report, shown, [shot.view for shot in shots])

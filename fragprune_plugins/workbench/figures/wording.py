@@ -14,8 +14,6 @@ from fragprune_plugins.workbench.goals import Faster, parse_goal
 
 _EQUAL = 0.005  # a ratio of fragments that reads 1.00
 
-_STRANGE, _HARDLY = 6.0, 16.0  # dB: between two models, and of the worse one
-
 CLAIMED = 2
 """Frame times count as different if they differ by this many standard errors."""
 
@@ -312,25 +310,6 @@ def _fell(before: dict[str, Any], after: dict[str, Any], control: dict[str, Any]
         return ""
     against = "the control" if control else "the model before"
     return f" Warning: PSNR fell by {loss:.2f} dB against {against}."
-
-
-def unrelated(a: dict[str, Any], b: dict[str, Any]) -> list[str]:
-    """A warning where one of two models A and B hardly shows the photographs that the other shows.
-
-    A fine-tuning loses a few dB at most. Models of other scenes, or in another world frame, lose
-    ten or more.
-    """
-    if None in (a["psnr"], b["psnr"]):
-        return []
-    names = ("A", "B") if a["psnr"] < b["psnr"] else ("B", "A")
-    worse, better = sorted((a["psnr"], b["psnr"]))
-    if better - worse < _STRANGE or worse > _HARDLY:
-        return []
-    return [
-        f"{names[0]} hardly shows these photographs ({worse:.1f} dB, {names[1]} {better:.1f} dB): "
-        "it may be a model of something else, or in another world frame, and the comparison of "
-        "speed means little"
-    ]
 
 
 def fewer(before: float, after: float) -> str:

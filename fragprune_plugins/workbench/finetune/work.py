@@ -24,7 +24,7 @@ from fragprune_plugins.workbench.commands.options import require_several
 from fragprune_plugins.workbench.distributed import ShardedEngine, part_of, whole_of
 from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.figures.evaluate import Candidate
-from fragprune_plugins.workbench.figures.matching import matched, shown_and_plain
+from fragprune_plugins.workbench.figures.matching import OTHER_SCENE, matched, shown_and_plain
 from fragprune_plugins.workbench.finetune import api, resuming
 from fragprune_plugins.workbench.finetune.finished import Asked, Finetuned, Opened, finished
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
@@ -41,13 +41,6 @@ from fragprune_plugins.workbench.scenes.output import CAMERAS
 from fragprune_plugins.workbench.scenes.training import exposed, moved, saw_held_out
 
 _say = partial(click.echo, err=True)
-
-OTHER_SCENE = 3.0
-"""dB of PSNR that a model has to be above pictures of one colour each, to be one of the scene.
-
-On two scenes trained models are by ten or more; on an object's photographs one that was moved is
-at -6 to 3, or up to 10 if it was moved a little.
-"""
 
 
 def finetune(**options: Any) -> Report | None:

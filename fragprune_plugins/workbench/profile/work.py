@@ -11,7 +11,7 @@ from fragprune_plugins.workbench.commands import opening
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
-from fragprune_plugins.workbench.figures.matching import told_or_matched
+from fragprune_plugins.workbench.figures.matching import hardly_shown, told_or_matched
 from fragprune_plugins.workbench.figures.pictures import leave_panels
 from fragprune_plugins.workbench.figures.wording import PROFILED, describe, nothing_drawn
 from fragprune_plugins.workbench.models.model import load, writable_folder
@@ -49,6 +49,7 @@ def profile(
     measurements = measure_all(list(columns.values()), shots, engine=rasterizer)
     measured = dict(zip(columns, measurements, strict=True))
     warnings = nothing_drawn([each["fragments_per_pixel"] for each in measurements])
+    warnings += hardly_shown({"MODEL": measurements[-1]["psnr"]}, shots)
     warnings += [] if itself else exposures_left_out(model)
     report: dict[str, Any] = {
         "model": str(model),
