@@ -2,6 +2,7 @@
 
 import importlib
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -155,3 +156,15 @@ def test_profile_has_a_column_with_thresholds_and_one_without(data, path, model,
     text = run("profile", path, "--data", data, "--views", "train").stdout
     assert "7 views" in text
     assert "fragments per pixel" in text
+
+
+def test_profile_measures_a_stop_without_cutoffs(data, path, model, tmp_path):
+    stopping = tmp_path / "stopping.ply"
+    write_ply(stopping, model.with_rules(stop=0.3))
+    report = run_json("profile", stopping, "--data", data, "--out", tmp_path / "pictures")
+    without, having = (report["columns"][key] for key in ("untruncated", "truncated"))
+    assert report["fragments_per_pixel"] == having["fragments_per_pixel"]
+    assert having["fragments_per_pixel"] < without["fragments_per_pixel"]
+    assert "with its stop" in run("profile", stopping, "--data", data).stdout
+    page = run_json("report", tmp_path / "pictures")["page"]
+    assert "with its stop" in Path(page).read_text(encoding="utf-8")

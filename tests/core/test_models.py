@@ -10,6 +10,7 @@ from finetune import tiny
 import fragprune_plugins as fp
 from fragprune_plugins.errors import DivergedError, OutputError
 from fragprune_plugins.files import sidecar
+from fragprune_plugins.workbench.models import formats
 from fragprune_plugins.workbench.models.formats.ply import write_ply
 
 
@@ -47,8 +48,14 @@ def test_the_file_is_the_one_that_the_command_line_writes(tmp_path):
 
 
 def test_what_cannot_be_saved_leaves_nothing(model, tmp_path):
+    """A format of 8 bits would hold numbers in place of NaN."""
     with pytest.raises(OutputError):
         fp.save(tmp_path / "a.png", model)
+    for suffix in formats.SUFFIXES:
+        with pytest.raises(OutputError, match="0 Gaussians"):
+            fp.save(tmp_path / f"a{suffix}", model.untruncated().keep(torch.zeros(60).bool()))
+        with pytest.raises(DivergedError, match=r"opacity \(60 of 60 rows\)"):
+            fp.save(tmp_path / f"a{suffix}", replace(model, opacity=model.opacity * torch.nan))
     with torch.no_grad():
         model.thresholds.logits[3] = torch.nan
     with pytest.raises(DivergedError):

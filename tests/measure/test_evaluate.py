@@ -79,9 +79,26 @@ class Smaller:
         return replace(outputs, image=outputs.image[:, ::2, ::2])
 
 
-def test_an_engine_that_draws_no_picture_of_the_view_is_named(truth, shots):
-    with pytest.raises(EngineError, match=r"engine smaller.*\(3, 16, 16\).*\(3, 32, 32\)"):
-        measure(truth, shots, engine=Smaller())
+class Nothing:
+    """Likewise, with pixels that are no numbers."""
+
+    name = "nothing"
+
+    def rasterize(self, inputs, thresholds):
+        outputs = engine_for("reference").rasterize(inputs, thresholds)
+        return replace(outputs, image=outputs.image.where(outputs.image > 0.2, torch.nan))
+
+
+@pytest.mark.parametrize(
+    ("engine", "said"),
+    [
+        (Smaller(), r"engine smaller.*\(3, 16, 16\).*\(3, 32, 32\)"),
+        (Nothing(), r"engine nothing: NaN in [1-9]\d* of 1024 pixels"),
+    ],
+)
+def test_an_engine_that_draws_no_picture_of_the_view_is_named(truth, shots, engine, said):
+    with pytest.raises(EngineError, match=said):
+        measure(truth, shots, engine=engine)
 
 
 def test_images_are_written_as_seen(tmp_path):

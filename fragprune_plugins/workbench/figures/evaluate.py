@@ -75,6 +75,10 @@ class Candidate:
             found = f"{type(outputs).__name__} with an image of shape {size}"
             expected = f"RasterOutputs with (3, {view.height}, {view.width})"
             raise EngineError(f"engine {engine.name}", found, expected, "Choose another --engine.")
+        if wrong := int(outputs.image.isnan().any(dim=0).sum()):
+            found = f"NaN in {wrong} of {view.width * view.height} pixels"
+            remedy = "Look for vast numbers in the model, or choose another --engine."
+            raise EngineError(f"engine {engine.name}", found, "a picture", remedy)
         return outputs
 
 

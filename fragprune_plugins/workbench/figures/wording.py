@@ -32,9 +32,6 @@ IS_CONTROL = ": a control, nothing is truncated."
 ITSELF = "itself"
 """The target of a measurement against the model's own pictures, as it came in."""
 
-PROFILED = {"untruncated": "without cutoffs", "truncated": "with cutoffs"}
-"""What people read for the columns of a profile."""
-
 VISIBLE = 35.0
 """A PSNR against itself, in dB, below which one is warned."""
 
@@ -57,6 +54,14 @@ def columns_of(data: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     learned = "control" if data["settings"]["goal"] == CONTROL else "pruned"
     columns = {"original": data.get("before"), learned: data.get("after")}
     return {name: each for name, each in columns.items() if each}
+
+
+def profiled(data: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """The measurements of a profile by what people read for them."""
+    columns = data["columns"]
+    what = "its stop" if len(columns) > 1 and not data["truncated"] else "cutoffs"
+    named = {"untruncated": f"without {what}", "truncated": f"with {what}"}
+    return {named[key]: each for key, each in columns.items()}
 
 
 def describe(columns: Mapping[str, dict[str, Any]]) -> str:

@@ -140,14 +140,17 @@ def save(path: str | Path, model: Model | Trained) -> None:
         model: what to write, or the result of a training.
 
     Raises:
-        OutputError: the place cannot be written, its name is no model's, or the format cannot hold
-            thresholds; existing files stay as they were.
-        DivergedError: learned values are not finite.
+        OutputError: the place cannot be written, its name is no model's, the format cannot hold
+            thresholds, or there is no Gaussian; existing files stay as they were.
+        DivergedError: values are not finite.
     """
     path, model = Path(path), of(model)
     form = formats.named(path)
-    if model.thresholds is not None:
-        expect_finite(model.thresholds.numbers, str(path))
+    learned = {} if model.thresholds is None else model.thresholds.numbers
+    expect_finite(model.tensors | learned, str(path))
+    if not len(model):
+        expected, remedy = "at least one", "Keep some: no command reads a file without any."
+        raise OutputError(str(path), "0 Gaussians", expected, remedy)
     with staging(path) as folder:
         new = folder / path.name
         try:

@@ -13,7 +13,7 @@ from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOpt
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
 from fragprune_plugins.workbench.figures.matching import hardly_shown, told_or_matched
 from fragprune_plugins.workbench.figures.pictures import leave_panels
-from fragprune_plugins.workbench.figures.wording import PROFILED, describe, nothing_drawn
+from fragprune_plugins.workbench.figures.wording import describe, nothing_drawn, profiled
 from fragprune_plugins.workbench.models.model import load, writable_folder
 from fragprune_plugins.workbench.scenes.training import exposures_left_out
 
@@ -44,7 +44,7 @@ def profile(
         _, dataset = told_or_matched(loaded.untruncated(), read, rasterizer)
     shots = opening.chosen(dataset, views)
     columns = {"untruncated": Candidate(loaded.untruncated())}
-    if loaded.falloff is not None:
+    if loaded.pruned:
         columns["truncated"] = Candidate(loaded)
     measurements = measure_all(list(columns.values()), shots, engine=rasterizer)
     measured = dict(zip(columns, measurements, strict=True))
@@ -58,10 +58,7 @@ def profile(
         "columns": measured,
         "warnings": warnings,
     }
-    lines = [
-        describe({PROFILED[key]: each for key, each in measured.items()}),
-        *(f"Warning: {each}" for each in warnings),
-    ]
+    lines = [describe(profiled(report)), *(f"Warning: {each}" for each in warnings)]
     if loaded.falloff is not None:
         points = (0.05, 0.25, 0.5, 0.75, 0.95)
         quantiles = np.quantile(loaded.falloff.cpu().numpy(), points).tolist()
@@ -71,6 +68,6 @@ def profile(
             + ", ".join(f"{value:.3f}" for value in quantiles)
         )
     if out is not None:
-        named = {PROFILED[key]: each for key, each in columns.items()}
+        named = dict(zip(profiled(report), columns.values(), strict=True))
         lines.append(leave_panels(out, "profile", report, named, shots, rasterizer))
     return Report(report, "\n".join(lines))

@@ -117,7 +117,7 @@ def _columns(record: Record) -> dict[str, dict[str, Any]]:
     if record.command == "compare":
         return {"A": data["a"], "B": data["b"]}
     if record.command == "profile":
-        return {wording.PROFILED[key]: each for key, each in data["columns"].items()}
+        return wording.profiled(data)
     return wording.columns_of(data)
 
 
