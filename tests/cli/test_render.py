@@ -3,10 +3,17 @@
 import json
 
 import pytest
+import torch
 from cli.commands import run, run_json
 from finetune import tiny
 from finetune.several import command
 from PIL import Image
+
+from fragprune_plugins import RasterInputs, load_dataset, rasterize
+from fragprune_plugins.hosts.photographs import Photographs
+from fragprune_plugins.workbench.figures import records
+from fragprune_plugins.workbench.figures.pictures import picture as picture_of
+from fragprune_plugins.workbench.figures.records import Recorded
 
 
 def size_of(file):
@@ -34,6 +41,30 @@ def test_held_out_views(data, drawn):
     assert (plain["truncated"], report["truncated"]) == (False, True)
     assert plain["fragments_per_pixel"] > report["fragments_per_pixel"]
     assert len(drawn("--data", data, "--views", "all")[1]) == 9
+
+
+def test_a_model_is_drawn_as_the_run_did_that_trained_it(data, cut, model, tmp_path, caplog):
+    """Commands that cannot, say so."""
+    rules = {"compensation": "antialiasing"}
+    told = Recorded(Photographs(data, centred=True), (cut, cut), filtered=True, drawing=rules)
+    records.leave(cut, "run", {"photographs": told.as_dict()})
+    run_json("render", cut, "--data", data, "--out", tmp_path)
+    shot = load_dataset(data).test[0]
+    inputs = RasterInputs(shot.view, model.splats(), **rules)
+    with torch.no_grad():
+        expected = rasterize(inputs, torch.full((len(model),), 0.3)).image
+    with Image.open(tmp_path / "view00.png") as picture:
+        assert picture.tobytes() == picture_of(expected).tobytes()
+    compared, profiled = run_json("compare", cut, cut), run_json("profile", cut, "--data", data)
+    assert profiled["psnr"] == compared["a"]["psnr"]
+    for words in (
+        ("view", cut, "--out", tmp_path / "page.html"),
+        ("audit", cut, "--data", data, "--views", 1),
+        ("finetune", cut, "--data", data, "--iters", 1, "--out", tmp_path / "out.ply"),
+    ):
+        caplog.clear()
+        run(*words)
+        assert "was trained with antialiasing" in caplog.text, words
 
 
 @pytest.mark.parametrize("size", [2, 3])

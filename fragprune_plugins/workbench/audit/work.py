@@ -12,7 +12,7 @@ from fragprune_plugins.workbench.audit import page
 from fragprune_plugins.workbench.audit.audit import audit as measured
 from fragprune_plugins.workbench.audit.placing import Placed, Side, place
 from fragprune_plugins.workbench.commands.command import Report
-from fragprune_plugins.workbench.commands.opening import open_engine
+from fragprune_plugins.workbench.commands.opening import open_engine, warn_if_antialiased
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.figures.records import strict
 from fragprune_plugins.workbench.figures.wording import nothing_drawn
@@ -42,6 +42,7 @@ def audit(
     """Do what ``fragprune audit`` promises; its options are the arguments."""
     rasterizer, device = open_engine(engine)
     loaded = load(model, truncation=not no_truncation, device=device)
+    warn_if_antialiased(model)
     if out is not None:
         writable_folder(out)
     if cameras is None and data is None and orbit is None:

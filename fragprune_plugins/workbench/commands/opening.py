@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ import click
 import torch
 
 from fragprune_plugins.engines import Engine, device_for
-from fragprune_plugins.errors import DatasetError, RecordError, UsageError, printable
+from fragprune_plugins.errors import DatasetError, RecordError, UsageError, log, printable
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.plugins.hooks import engine_for
@@ -89,6 +89,23 @@ def _recorded(model: Path) -> Photographs | None:
     if read := records.recorded(record):
         return read.photographs
     return trained_on(records.located(str(record.data.get("model")), record.path.parent))
+
+
+def as_trained(model: Path) -> tuple[bool, Mapping[str, Any]]:
+    """The ``filtered`` and the ``drawing`` of a model, by the record of the run that trained it."""
+    with contextlib.suppress(RecordError):
+        if (record := records.beside(model)) and (read := records.recorded(record)):
+            return read.filtered, read.drawing
+    return False, {}
+
+
+def warn_if_antialiased(model: Path) -> None:
+    """Warn of a model that its run drew with antialiasing, in a command that draws without."""
+    if as_trained(model)[1].get("compensation", "none") != "none":
+        log.warning(
+            "%s was trained with antialiasing, and is drawn here as 3DGS draws, without",
+            printable(str(model)),
+        )
 
 
 def overridden(photographs: Photographs, scene: SceneOptions) -> Photographs:

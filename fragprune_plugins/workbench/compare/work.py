@@ -47,7 +47,7 @@ def compare(
     candidates = []
     for path in (a, b):
         how = known.get(path)
-        filtered, drawing = (how.filtered, how.drawing) if how else (False, {})
+        filtered, drawing = (how.filtered, {} if own else how.drawing) if how else (False, {})
         model = load(path, truncation=not no_truncation, filtered=filtered, device=device)
         candidates.append(Candidate(model, drawing))
     if own is not None:

@@ -19,6 +19,7 @@ from fragprune_plugins.workbench.commands.opening import (
     open_engine,
     own_cameras_for,
     photographs_for,
+    warn_if_antialiased,
 )
 from fragprune_plugins.workbench.commands.options import require_several
 from fragprune_plugins.workbench.distributed import ShardedEngine, part_of, whole_of
@@ -94,6 +95,7 @@ def _open(asked: Asked) -> Opened:
     truncation = settings.goal.presses and not asked.no_truncation
     where = "cpu" if asked.shard else device
     whole = models.load(asked.model, truncation=truncation, device=where)
+    warn_if_antialiased(asked.model)
     if asked.itself:
         own = own_cameras_for(asked.model, scene, asked.cameras, asked.seed)
         asked = replace(asked, scene=own.scene, cameras=own.cameras)

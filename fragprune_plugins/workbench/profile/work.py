@@ -34,8 +34,10 @@ def profile(
     rasterizer, device = opening.open_engine(engine)
     if out is not None:
         writable_folder(out)
-    loaded = load(model, truncation=not no_truncation, device=device)
+    filtered, drawing = opening.as_trained(model)
+    loaded = load(model, truncation=not no_truncation, filtered=filtered, device=device)
     if itself:
+        drawing = {}  # as its own pictures are drawn
         own = opening.own_cameras_for(model, scene, cameras, orbit=orbit)
         dataset = own.pictures(loaded.untruncated(), rasterizer)
     else:
@@ -43,9 +45,9 @@ def profile(
         read = opening.photographs_for(model, scene, remedy=remedy)
         _, dataset = told_or_matched(loaded.untruncated(), read, rasterizer)
     shots = opening.chosen(dataset, views)
-    columns = {"untruncated": Candidate(loaded.untruncated())}
+    columns = {"untruncated": Candidate(loaded.untruncated(), drawing)}
     if loaded.pruned:
-        columns["truncated"] = Candidate(loaded)
+        columns["truncated"] = Candidate(loaded, drawing)
     measurements = measure_all(list(columns.values()), shots, engine=rasterizer)
     measured = dict(zip(columns, measurements, strict=True))
     warnings = nothing_drawn([each["fragments_per_pixel"] for each in measurements])

@@ -62,7 +62,9 @@ def render(
         cameras = _expect_cameras(cameras or cameras_of(model))
     rasterizer, device = opening.open_engine(engine)
     writable_folder(out.parent if film else out)
-    whole = load(model, truncation=not no_truncation, device="cpu" if shard else device)
+    filtered, drawing = opening.as_trained(model)
+    where = "cpu" if shard else device
+    whole = load(model, truncation=not no_truncation, filtered=filtered, device=where)
     if scene.data is not None:
         dataset = load_photographs(opening.photographs_for(model, scene))
         named = [(shot.name, shot.view) for shot in opening.chosen(dataset, views)]
@@ -71,7 +73,7 @@ def render(
     if film and not orbit:
         named = filming.along(named, max(FRAMES, len(named)))
     with joined(device) if shard else nullcontext(Ranks()) as ranks:
-        candidate = Candidate(part_of(whole, ranks, device) if shard else whole)
+        candidate = Candidate(part_of(whole, ranks, device) if shard else whole, drawing)
         drawer = ShardedEngine(rasterizer, ranks) if shard else rasterizer
         fragments: dict[int, float] = {}
 

@@ -13,7 +13,7 @@ from fragprune_plugins.errors import OutputError
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.reading import lies_in
 from fragprune_plugins.workbench.commands.command import Report
-from fragprune_plugins.workbench.commands.opening import drawn_as_trained
+from fragprune_plugins.workbench.commands.opening import drawn_as_trained, warn_if_antialiased
 from fragprune_plugins.workbench.commands.options import SceneOptions
 from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.figures.viewing import overview
@@ -44,6 +44,8 @@ def view(
     other = other or _original(model)
     paths = [each for each in (model, other) if each is not None]
     models = [load(each) for each in paths]
+    for path in paths:
+        warn_if_antialiased(path)
     truncated = [each.falloff is not None for each in models]
     if truncated == [True, False]:  # the original stands left of the split
         for each in (paths, models, truncated):
