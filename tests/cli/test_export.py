@@ -1,5 +1,6 @@
 """fragprune export."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -10,6 +11,7 @@ from finetune import tiny
 import fragprune_plugins as fp
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply
+from fragprune_plugins.workbench.figures.wording import VISIBLE
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.models.formats.ply import write_ply
 
@@ -23,6 +25,23 @@ def test_one_file_with_the_thresholds(path, model, out):
     assert all(torch.equal(exported[name], expected[name]) for name in model.tensors)
     assert torch.equal(read_ply(out).falloff, fp.load(path).falloff)
     assert not sidecar.path_beside(out).exists()
+
+
+@pytest.mark.parametrize(
+    ("suffix", "times", "far"),
+    [(".spz", 1e-3, 0), (".spz", 1e4, 0), (".compressed.ply", 1, 1e4)],
+    ids=["positions in too few bits", "scales cut off", "one Gaussian far away"],
+)
+def test_what_a_format_makes_of_the_picture_is_said(path, model, tmp_path, suffix, times, far):
+    assert run_json("export", path, "--out", tmp_path / "a.ply")["psnr"] is None
+    words = ("export", path, "--out", tmp_path / f"a{suffix}")
+    assert run_json(*words)["psnr"] > VISIBLE
+    assert "Warning" not in run(*words).stdout
+    places = times * model.xyz
+    places[0, 0] += far
+    write_ply(path, replace(model, xyz=places, scaling=model.scaling + math.log(times)))
+    assert run_json(*words)["psnr"] < VISIBLE
+    assert "Warning: below 35 dB the change can be seen." in run(*words).stdout
 
 
 def test_drops_what_no_view_can_draw(path, model, out):

@@ -99,13 +99,14 @@ def as_trained(model: Path) -> tuple[bool, Mapping[str, Any]]:
     return False, {}
 
 
-def warn_if_antialiased(model: Path) -> None:
-    """Warn of a model that its run drew with antialiasing, in a command that draws without."""
-    if as_trained(model)[1].get("compensation", "none") != "none":
-        log.warning(
-            "%s was trained with antialiasing, and is drawn here as 3DGS draws, without",
-            printable(str(model)),
-        )
+def warn_if_antialiased(*models: Path) -> None:
+    """Warn of models that their runs drew with antialiasing, in a command that draws without."""
+    for model in models:
+        if as_trained(model)[1].get("compensation", "none") != "none":
+            log.warning(
+                "%s was trained with antialiasing, and is drawn here as 3DGS draws, without",
+                printable(str(model)),
+            )
 
 
 def overridden(photographs: Photographs, scene: SceneOptions) -> Photographs:

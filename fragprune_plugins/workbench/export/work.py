@@ -12,6 +12,9 @@ from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.ply import THRESHOLD_COLUMN
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.workbench.commands.command import Report
+from fragprune_plugins.workbench.figures.metrics import psnr
+from fragprune_plugins.workbench.figures.viewing import overview, rasterize
+from fragprune_plugins.workbench.figures.wording import VISIBLE
 from fragprune_plugins.workbench.models import formats
 from fragprune_plugins.workbench.models.model import describe_written, load, require_place, save
 from fragprune_plugins.workbench.pruning import visible
@@ -45,17 +48,15 @@ def export(
     save(out, splat)
     truncated = splat.falloff is not None
     column = THRESHOLD_COLUMN if form.paired and truncated else None
-    held = "cutoffs" if truncated else "no cutoffs"
-    held += f" in the column {column}" if column else ""
-    held += "" if splat.rim == "hard" else f" and a {splat.rim} rim"
-    held += "" if splat.stop is None else f" and a stop at {splat.stop:g}"
-    held = f": {len(splat)} Gaussian{'' if len(splat) == 1 else 's'} with {held}"
-    lines.append(describe_written(out, held, pruned=splat.pruned))
+    lines.append(describe_written(out, _held(splat, column), pruned=splat.pruned))
+    kept = _kept(splat, out) if form.keeps else None
+    lines += [] if kept is None else [_said(kept)]
     data = {
         "model": str(model),
         "out": str(out),
         "format": form.name,
         "keeps": form.keeps or None,
+        "psnr": kept,
         "gaussians": len(splat),
         "thresholds": truncated,
         **splat.rules,
@@ -63,6 +64,34 @@ def export(
         "dropped": dropped,
     }
     return Report(data, "\n".join(lines))
+
+
+def _held(splat: Model, column: str | None) -> str:
+    """What a file holds: Gaussians, cutoffs, the rules."""
+    held = "no cutoffs" if splat.falloff is None else "cutoffs"
+    held += f" in the column {column}" if column else ""
+    held += "" if splat.rim == "hard" else f" and a {splat.rim} rim"
+    held += "" if splat.stop is None else f" and a stop at {splat.stop:g}"
+    return f": {len(splat)} Gaussian{'' if len(splat) == 1 else 's'} with {held}"
+
+
+def _kept(splat: Model, out: Path) -> float:
+    """PSNR, dB, of what a file shows from outside against what the model does."""
+    view = overview(splat, width=480, height=360)
+    with torch.no_grad():
+        shown, whole = (rasterize(each, view).image for each in (load(out), splat))
+    return psnr(shown, whole)
+
+
+def _said(kept: float) -> str:
+    """A sentence on the picture that a format keeps."""
+    found = "equal to" if kept == torch.inf else f"at {kept:.1f} dB PSNR against"
+    warning = (
+        f" Warning: below {VISIBLE:g} dB the change can be seen. Choose another format; a Gaussian "
+        "far from all others, or a scene of very small or large units, takes its bits."
+    )
+    said = f"From outside, the file's picture is {found} the model's."
+    return said + (warning if kept < VISIBLE else "")
 
 
 def _restored(edited: Model, path: Path, source: Path) -> Model:

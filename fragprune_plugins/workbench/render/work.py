@@ -63,8 +63,8 @@ def render(
     rasterizer, device = opening.open_engine(engine)
     writable_folder(out.parent if film else out)
     filtered, drawing = opening.as_trained(model)
-    where = "cpu" if shard else device
-    whole = load(model, truncation=not no_truncation, filtered=filtered, device=where)
+    place = "cpu" if shard else device
+    whole = load(model, truncation=not no_truncation, filtered=filtered, device=place)
     if scene.data is not None:
         dataset = load_photographs(opening.photographs_for(model, scene))
         named = [(shot.name, shot.view) for shot in opening.chosen(dataset, views)]
@@ -83,17 +83,15 @@ def render(
             fragments[index] = float(outputs.fragments_per_pixel)
             return outputs.image
 
-        names = stems([name for name, _ in named])
-        files = [out] if film else [out / f"{name}.png" for name in names]
+        files = [out] if film else [out / f"{n}.png" for n in stems([each for each, _ in named])]
         if film:
             bar = tqdm(range(len(named)), desc="filming", unit="frame", leave=None)
             filming.write_mp4(out, map(draw, bar), FPS)
         else:
             _save(files, draw, ranks)
-        everybody = ranks.gather(fragments)
+        drawn = {index: each[index] for each in ranks.gather(fragments) for index in each}
     if not ranks.first:
         return None
-    drawn = {index: each[index] for each in everybody for index in each}  # some draw one twice
     figures = {
         "model": str(model),
         "files": [str(file) for file in files],

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import click
-import torch
 
 from fragprune_plugins.errors import OutputError
 from fragprune_plugins.files.atomic import replacing
@@ -44,19 +43,16 @@ def view(
     other = other or _original(model)
     paths = [each for each in (model, other) if each is not None]
     models = [load(each) for each in paths]
-    for path in paths:
-        warn_if_antialiased(path)
+    warn_if_antialiased(*paths)
     truncated = [each.falloff is not None for each in models]
     if truncated == [True, False]:  # the original stands left of the split
         for each in (paths, models, truncated):
             each.reverse()
     scene = SceneOptions(data, white_background=white_background)
     shown = _cameras(scene, cameras or cameras_of(model), paths)
-    if shown:
-        start = shown[0].view
-    else:
-        start = overview(models[-1])
-        start.background.copy_(torch.full((3,), float(white_background)))
+    start = shown[0].view if shown else overview(models[-1])
+    if not shown:
+        start.background.fill_(float(white_background))
     site = sites.make_site(model.name, models, _layers(paths, truncated), shown, start)
     facts: dict[str, Any] = {
         "model": str(model),
@@ -70,8 +66,8 @@ def view(
         "rounded": [],
     }
     if out is None:
-        facts["address"] = _serve(site, port, browse=not no_browser)
-        return Report(facts, "The viewer is closed.")
+        address = _serve(site, port, browse=not no_browser)
+        return Report(facts | {"address": address}, "The viewer is closed.")
     site, rounded = sites.compacted(site)
     if single:
         page = sites.single_page(site)
