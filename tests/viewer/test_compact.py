@@ -136,6 +136,20 @@ def test_a_small_unit_does_not_make_a_scene_coarse():
     assert off < model.xyz.abs().max() / 1000
 
 
+def test_a_scale_of_nearly_nothing_does_not_make_the_others_coarse():
+    """As of a Gaussian that an editor has flattened."""
+    model = a_model()
+    for least in (-80, -9):  # all other logarithms are then of 300 steps
+        model.scaling[5] = least
+        data, facts = pack(model)
+        small, more, _ = compact(data, facts)
+        low, high = facts["scales"]
+        scales = low + expand(small, facts | more)[0][:, 12:15] / 65535 * (high - low)
+        off = np.abs(scales - model.scaling[morton_order(model)].numpy())
+        assert np.quantile(off, 0.9) <= 1 / 32 + 1e-3
+        model.scaling[6:] = torch.linspace(-9, 9, 3 * (len(model) - 6)).reshape(-1, 3)
+
+
 def test_a_model_with_a_mean_that_no_step_reaches_keeps_its_tables():
     far, near = a_model(), a_model()
     far.xyz[3, 1] = 1e9

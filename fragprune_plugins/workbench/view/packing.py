@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 from fragprune_plugins.constants import ALPHA_MIN
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.workbench.models.formats.arrays import z_order
+from fragprune_plugins.workbench.models.formats.palette import codebook, nearest
 
 CUTOFF_MAX = -2 * math.log(ALPHA_MIN)
 """The largest cutoff that decides anything: a fragment beyond it is fainter than 1/255."""
@@ -223,10 +224,14 @@ def _cutoffs(shares: Words) -> Words:
 
 
 def _scales(shares: Words, extent: float) -> Words:
-    """To steps of 1/16 of a logarithm, or to 256 steps of a wide extent."""
-    step = max(1 / 16, extent / 255) * 65535 / extent
-    rounded: Words = np.rint(np.rint(shares / step) * step).clip(0, 65535).astype(np.uint16)
-    return rounded
+    """To steps of 1/16 of a logarithm, or to 256 values if that is more."""
+    step = 65535 / 16 / extent
+    rounded = np.rint(np.rint(shares / step) * step).clip(0, 65535).astype(np.uint16)
+    if len(np.unique(rounded)) <= _BOOK:
+        return rounded
+    book = codebook(shares)
+    few: Words = np.rint(book)[nearest(book, shares)].astype(np.uint16)
+    return few
 
 
 def _singles(halves: Words) -> NDArray[np.float32]:
