@@ -76,6 +76,16 @@ def test_a_film_holds_the_pictures_in_their_order(tmp_path):
         assert abs(float(picture.mean()) - 255 * grey) < 4  # H.264 loses a little
 
 
+def test_a_film_has_the_colours_of_its_pictures_and_says_which_they_are(tmp_path):
+    """Players guess by its size else."""
+    path, green = tmp_path / "a.mp4", torch.tensor([0.1, 0.8, 0.2])
+    write_mp4(path, [green[:, None, None].expand(3, 48, 64)], 10)
+    words = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(path)]
+    said = subprocess.run(words, capture_output=True, text=True).stderr
+    assert "yuv420p(tv, bt709/bt709/iec61966-2-1" in said
+    assert np.abs(frames_of(path)[2][0] - 255 * green.numpy()).max() < 4
+
+
 def test_a_failed_film_leaves_the_earlier_one(tmp_path):
     path = tmp_path / "a.mp4"
     path.write_bytes(b"earlier")

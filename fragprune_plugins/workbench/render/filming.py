@@ -22,6 +22,14 @@ from fragprune_plugins.workbench.figures.viewing import overview
 from fragprune_plugins.workbench.scenes.generated import Named, bounds, interpolate, moved
 from fragprune_plugins.workbench.scenes.pinhole import look_at
 
+_COLOURS = [
+    "-vf",
+    "scale=out_color_matrix=bt709:out_range=tv,"
+    "setparams=range=tv:colorspace=bt709:color_primaries=bt709:color_trc=iec61966-2-1",
+]
+"""Of ffmpeg. By itself it writes those of BT.601, and does not say so; players take films of 720
+rows for BT.709, and show greens and reds 20 levels of 255 off."""
+
 _PICTURE: dict[str, Any] = {"width": 1280, "height": 720, "fov_y": 50.0}
 
 
@@ -89,9 +97,8 @@ def write_mp4(path: Path, frames: Iterable[Tensor], fps: int) -> None:
                 even = frame[:, : frame.shape[1] // 2 * 2, : frame.shape[2] // 2 * 2]
                 shown = picture(even)
                 if writer is None:
-                    writer = encoder.write_frames(
-                        str(temporary), shown.size, fps=fps, macro_block_size=2, quality=8
-                    )
+                    how = {"macro_block_size": 2, "quality": 8, "output_params": _COLOURS}
+                    writer = encoder.write_frames(str(temporary), shown.size, fps=fps, **how)
                     writer.send(None)
                 writer.send(shown.tobytes())
             if writer is not None:
