@@ -149,6 +149,23 @@ def test_beside_data_the_training_says_whether_it_drew_over_white(data, model, t
     assert run_json("profile", known, "--data", data)["views"] == 2
 
 
+@pytest.mark.parametrize("white", [True, False])
+def test_pictures_have_the_background_of_the_training(data, model, tmp_path, white):
+    """Also those of what was fine-tuned from its own pictures."""
+    known = tiny.host_output(tmp_path / "out", data, model, white_background=white)
+    pruned = tmp_path / "pruned.ply"
+    run_json("finetune", known, "--self", "--resolution", 2, "--iters", 1, "--out", pruned)
+    for each in (known, pruned):
+        words = ("--cameras", known / "cameras.json", "--out")
+        (file, *_) = run_json("render", each, *words, tmp_path / "pictures")["files"]
+        with Image.open(file) as picture:
+            assert picture.getpixel((0, 0)) == (255 * white,) * 3
+        page = tmp_path / "page"
+        run_json("view", each, *words, page)
+        background = json.loads((page / "scene.json").read_text())["background"]
+        assert background == [float(white)] * 3
+
+
 def test_a_model_elsewhere_needs_data(path):
     fails("profile", path, says="no cfg_args")
 

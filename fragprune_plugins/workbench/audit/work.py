@@ -12,8 +12,12 @@ from fragprune_plugins.workbench.audit import page
 from fragprune_plugins.workbench.audit.audit import audit as measured
 from fragprune_plugins.workbench.audit.placing import Placed, Side, place
 from fragprune_plugins.workbench.commands.command import Report
-from fragprune_plugins.workbench.commands.opening import open_engine, warn_if_antialiased
-from fragprune_plugins.workbench.commands.options import EngineOptions
+from fragprune_plugins.workbench.commands.opening import (
+    open_engine,
+    over_its_background,
+    warn_if_antialiased,
+)
+from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
 from fragprune_plugins.workbench.figures.records import strict
 from fragprune_plugins.workbench.figures.wording import nothing_drawn
 from fragprune_plugins.workbench.models.model import load, writable_folder
@@ -51,7 +55,8 @@ def audit(
         side: Side = "auto" if orbit is None else "orbit" if orbit else "inside"
         placed = place(loaded, views, rasterizer, side=side, divide=resolution or 1)
     else:
-        placed = _given(cameras, data, views, resolution, white_background)
+        scene = over_its_background(model, SceneOptions(white_background=white_background))
+        placed = _given(cameras, data, views, resolution, scene.white_background)
     named = [(name, view.to(device)) for name, view in placed.views]
     measurements, shown = measured(loaded, named, engine=rasterizer, progress=True)
     figures: dict[str, Any] = {

@@ -166,8 +166,18 @@ def own_cameras_for(
     named = orbit or scene.data is not None or cameras is not None
     if not named and (cameras := cameras_of(model)):
         click.echo(printable(f"Cameras: {cameras}, of its training"), err=True)
+    return OwnCameras(over_its_background(model, scene), cameras, seed)
+
+
+def over_its_background(model: Path, scene: SceneOptions) -> SceneOptions:
+    """The options, over white also where a model's training or its record says that it was."""
     white = scene.white_background or over_white(model)
-    return OwnCameras(replace(scene, white_background=white), cameras, seed)
+    with contextlib.suppress(RecordError):
+        if not white and (record := records.beside(model)):
+            own, read = own_cameras(record), records.recorded(record)
+            white = bool(own and own.scene.white_background)
+            white |= bool(read and read.photographs.white_background)
+    return replace(scene, white_background=white)
 
 
 def own_cameras(record: records.Record, scene: SceneOptions | None = None) -> OwnCameras | None:

@@ -69,7 +69,7 @@ def render(
         dataset = load_photographs(opening.photographs_for(model, scene))
         named = [(shot.name, shot.view) for shot in opening.chosen(dataset, views)]
     else:
-        named = _views(whole, cameras, scene, up)
+        named = _views(whole, cameras, opening.over_its_background(model, scene), up)
     if film and not orbit:
         named = filming.along(named, max(FRAMES, len(named)))
     with joined(device) if shard else nullcontext(Ranks()) as ranks:

@@ -12,7 +12,11 @@ from fragprune_plugins.errors import OutputError
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.reading import lies_in
 from fragprune_plugins.workbench.commands.command import Report
-from fragprune_plugins.workbench.commands.opening import drawn_as_trained, warn_if_antialiased
+from fragprune_plugins.workbench.commands.opening import (
+    drawn_as_trained,
+    over_its_background,
+    warn_if_antialiased,
+)
 from fragprune_plugins.workbench.commands.options import SceneOptions
 from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.figures.viewing import overview
@@ -48,11 +52,11 @@ def view(
     if truncated == [True, False]:  # the original stands left of the split
         for each in (paths, models, truncated):
             each.reverse()
-    scene = SceneOptions(data, white_background=white_background)
+    scene = over_its_background(model, SceneOptions(data, white_background=white_background))
     shown = _cameras(scene, cameras or cameras_of(model), paths)
     start = shown[0].view if shown else overview(models[-1])
     if not shown:
-        start.background.fill_(float(white_background))
+        start.background.fill_(float(scene.white_background))
     site = sites.make_site(model.name, models, _layers(paths, truncated), shown, start)
     facts: dict[str, Any] = {
         "model": str(model),
