@@ -11,6 +11,8 @@ import torch
 from cli.commands import run, run_error, run_json
 from finetune import tiny
 
+import fragprune_plugins as fp
+from fragprune_plugins import Model
 from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.report import page as report_page
@@ -128,6 +130,13 @@ def test_without_the_photographs_there_are_curves_and_the_reason(out, data, reco
     assert len(run_json("report", out, "--data", data)["views"]) > 0
     elsewhere = ("--data", tmp_path / "nowhere")
     assert run_error("report", out, *elsewhere, "--json")["code"] == "dataset"
+
+
+@pytest.mark.parametrize("edit", [Model.untruncated, lambda m: m.keep(m.opacity[:, 0] > 0)])
+def test_a_model_that_was_edited_since_is_not_shown_with_its_old_figures(out, data, edit):
+    fp.save(out / "pruned.ply", edit(load(out / "pruned.ply")))
+    result = run("report", out, "--data", data)
+    assert "No views are shown: pruned.ply was changed since." in result.stdout
 
 
 def test_what_a_fine_tuning_leaves_names_no_folder_of_the_machine(finetuned, out, data, tmp_path):

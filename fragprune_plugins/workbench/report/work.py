@@ -284,8 +284,17 @@ def _draw(
         if data is not None:  # the user asked for the views
             raise
         return None, learning, f"No views are shown: {error}"
+    if _rewritten(record, loaded[-1]):
+        return None, learning, f"No views are shown: {source.models[-1].name} was changed since."
     before, after = (Candidate(each, source.drawing) for each in loaded)
     return report_page.draw_views(folder, before, after, dataset.test, engine), learning, ""
+
+
+def _rewritten(record: Record, after: Model) -> bool:
+    """Whether a model has lost Gaussians or cutoffs since, as in an editor."""
+    figures = record.data.get("after") or {}
+    lost = bool(record.data.get("untruncated")) and not after.pruned
+    return lost or figures.get("gaussians", len(after)) != len(after)
 
 
 def _files(every: list[Record], inside: Path, folder: Path) -> list[tuple[str, str]]:
