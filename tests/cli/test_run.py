@@ -96,6 +96,7 @@ def test_a_page_is_advised_where_view_shows(name, beside, shown, trained, tmp_pa
     monkeypatch.setattr(launch, "run", lambda *_: summary)
     said = run("run", "--", HOST / "train.py").stdout
     assert (f"fragprune view {model}" in said) == shown
+    assert (f"fragprune export {model} --out pruned.ply" in said) == shown
     assert f"fragprune report {tmp_path}" in said
 
 

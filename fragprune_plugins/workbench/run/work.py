@@ -29,6 +29,7 @@ from fragprune_plugins.errors import (
     log,
 )
 from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.injection import launch
 from fragprune_plugins.injection.process import current_gpu
@@ -299,8 +300,14 @@ def _describe(summary: launch.RunSummary, data: dict[str, Any]) -> str:
     )
     if summary.model_after and summary.output:
         scene = summary.photographs.folder if summary.photographs else None
-        shown = summary.model_after if _viewable(summary.model_after) else None
-        lines.append(wording.next_steps(shown, summary.output, scene))
+        shown = _viewable(summary.model_after)
+        if shown and shown.pruned and (beside := sidecar.find(summary.model_after)):
+            lines.append(
+                f"Its cutoffs lie beside it, in {beside.name}: without that it looks worse. To "
+                f"have one: fragprune export {wording.quoted(summary.model_after)} --out pruned.ply"
+            )
+        look = summary.model_after if shown else None
+        lines.append(wording.next_steps(look, summary.output, scene))
     return "\n".join(lines)
 
 
@@ -316,13 +323,12 @@ def _measured(summary: launch.RunSummary) -> str:
     return f"\n{said}\nCompare: fragprune compare {summary.model_before} {summary.model_after}"
 
 
-def _viewable(model: Path) -> bool:
-    """Whether the file alone shows what its host draws, so that ``fragprune view`` takes it."""
+def _viewable(path: Path) -> Model | None:
+    """The model, if its file shows what its host draws, so that ``fragprune view`` takes it."""
     try:
-        load(model)
+        return load(path)
     except FragpruneError:
-        return False
-    return True
+        return None
 
 
 @dataclass
