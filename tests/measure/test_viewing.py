@@ -102,3 +102,12 @@ def test_a_picture_is_truncated_as_the_thresholds_say():
     expected = (255 * image.clamp(0, 1)).round().byte().permute(1, 2, 0).numpy()
     assert np.array_equal(drawn, expected)
     assert not np.array_equal(drawn, np.asarray(fp.render_view(splat, view)))
+
+
+@pytest.mark.parametrize("value", [-0.1, 1.5, 9.0, float("nan")])
+def test_thresholds_that_are_no_falloffs_are_refused(value):
+    """They would draw nothing, or not what was meant: 9 is the cutoff of three deviations."""
+    model = tiny.random_model()
+    inputs = fp.RasterInputs(fp.overview(model, width=32, height=24), model.splats())
+    with pytest.raises(InputError, match=r"thresholds: numbers outside \[0, 1\]"):
+        fp.rasterize(inputs, torch.full((len(model),), value))

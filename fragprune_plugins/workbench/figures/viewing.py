@@ -125,7 +125,8 @@ def rasterize(
         engine: a name ("auto", "reference", "cpu", "cuda", a plugin's) or an engine object.
 
     Raises:
-        InputError: thresholds that do not match the Gaussians, or a model without a view.
+        InputError: thresholds that are no falloffs, or do not match the Gaussians; or a model
+            without a view.
         EngineError: there is no such engine here.
         PluginError: a plugin raised, or its answer cannot be used.
     """
@@ -135,8 +136,12 @@ def rasterize(
         stop = thresholds.stop if inputs.stop is None else inputs.stop
         rim = thresholds.rim if inputs.rim == "hard" else inputs.rim
         inputs = replace(inputs, stop=stop, rim=rim)
+    own = thresholds if isinstance(thresholds, Tensor) else None
     thresholds = thresholds_for(inputs, thresholds)
     inputs.check_thresholds(thresholds)  # also for engines that are not ours
+    if own is not None and not ((own >= 0) & (own <= 1)).all():
+        remedy = "Pass exp(-q / 2) of a cutoff q."
+        raise InputError("thresholds", "numbers outside [0, 1]", "falloffs", remedy)
     return engine_for(engine, inputs.splats.device).rasterize(inputs, thresholds)
 
 
