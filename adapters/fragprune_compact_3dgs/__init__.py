@@ -118,7 +118,7 @@ class Compact3DGS(GraphdecoAdapter):
         """The group's name; the network's group has none in the host, so it gets ours."""
         return str(group.get("name", NETWORK))
 
-    def prepare_stage2(self, model: Any, output: Path | None) -> None:
+    def prepare_stage2(self, model: Any, start: Path | None) -> None:
         """Stop the codebooks in use, which learn in the forward pass, as the host does too."""
         for codebooks in (model.vq_scale, model.vq_rot):
             for layer in codebooks.layers:

@@ -145,7 +145,7 @@ class RT4DGS(GraphdecoAdapter):
         """The environment map, whose optimizer is a local of the training loop."""
         return [model.env_map] if getattr(model.env_map, "requires_grad", False) else []
 
-    def prepare_stage2(self, model: Any, output: Path | None) -> None:
+    def prepare_stage2(self, model: Any, start: Path | None) -> None:
         """Restore the environment map, which the host replaced by a new black one."""
         import torch
 

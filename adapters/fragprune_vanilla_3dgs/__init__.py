@@ -8,6 +8,8 @@ before mid-July 2023 have no checkpoints, so stage 2 is not possible.
 
 from __future__ import annotations
 
+import contextlib
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -101,13 +103,21 @@ class Vanilla3DGS(GraphdecoAdapter):
         has_separate_sh = "separate_sh" in (repo.parameters("gaussian_renderer", "render") or ())
         return "October 2024" if has_separate_sh else "August 2024"
 
-    def prepare_stage2(self, model: Any, output: Path | None) -> None:
-        """Restore exposures, which the host's checkpoint lacks."""
+    def prepare_stage2(self, model: Any, start: Path | None) -> None:
+        """Restore exposures, which the host's checkpoint lacks.
+
+        Stage 2 writes its own over them. So a copy stays with the start, for the next stage 2.
+        """
         import torch
 
         mapping = getattr(model, "exposure_mapping", None)
-        file = output / "exposure.json" if output else None
-        if not mapping or file is None or not file.exists():
+        if not mapping or start is None:
+            return
+        folder = start.absolute().parents[2 if start.suffix == ".ply" else 0]
+        file, copy = folder / "exposure.json", start.with_suffix(".exposure.json")
+        kept = copy.exists() and copy.stat().st_mtime_ns >= start.stat().st_mtime_ns
+        file = copy if kept else file
+        if not file.exists():
             return
         with _EXPOSURES.reading(file) as reading, torch.no_grad():
             saved = reading.json()
@@ -115,3 +125,7 @@ class Vanilla3DGS(GraphdecoAdapter):
                 if image in saved:
                     reading.place = image
                     model._exposure[row] = torch.tensor(saved[image]).to(model._exposure)
+            neutral = torch.eye(3, 4).to(model._exposure)
+        if not kept and bool((model._exposure != neutral).any()):
+            with contextlib.suppress(OSError):  # of a folder of somebody else
+                shutil.copy(file, copy)

@@ -357,11 +357,11 @@ class HostAdapter(ABC):
         """Trained parameters outside the known optimizers, which drawing alone moves."""
         return []
 
-    def prepare_stage2(self, model: Any, output: Path | None) -> None:  # noqa: B027 - optional
+    def prepare_stage2(self, model: Any, start: Path | None) -> None:  # noqa: B027 - optional
         """Restore state that the host's own resume loses.
 
         Args:
-            output: the folder of the run that was resumed; None if stage 2 resumes none.
+            start: the checkpoint or PLY that stage 2 resumes; None if it follows in one run.
         """
 
 

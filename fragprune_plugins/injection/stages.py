@@ -159,7 +159,7 @@ class Stages:
         log.info("stage 2: %d iterations from iteration %d, %s: %s", settings.iterations, *start)
         line = self.host.line
         with starting.resumable(self.adapter, line, start) as checkpoint:
-            self.before = self._model(start.iteration)
+            self.before = starting.model_of(self.adapter, start)
             first = 0 if line.restarts else start.iteration
             total = first + settings.iterations + line.skipped
             extra = {"iterations": total, "resume": str(checkpoint)}
@@ -172,7 +172,8 @@ class Stages:
             if kept is not None:
                 extra["resume"] = str(starting.part_of(checkpoint, kept, self.scratch))
             arguments = self.host.saving(self.scratch, total, **extra)
-            self._learn(total, arguments, start=first, settings=self.settings)
+            origin = {"start": first, "origin": start.path}
+            self._learn(total, arguments, settings=self.settings, **origin)
 
     def _apart(self, own: str = "") -> dict[str, str]:
         """Save what learns in this folder in the output folder, a control always in one of its own.
@@ -247,7 +248,6 @@ class Stages:
             prove=self.options.stage != "off",
             trust=self.options.trust,
             output=self.output,
-            origin=self.around if self.start or options.get("start") else None,
             **options,
         )
         session.unproved = self.unproved
@@ -371,12 +371,18 @@ class Stages:
             raise UsageError(f"--stage {self.options.stage}", found, expected, remedy)
         settings = replace(self.options.settings, iterations=end - (resumed if joint else start))
         options: dict[str, Any] = {"from_step": start - resumed}
+        if file and start == resumed:
+            options["origin"] = Path(file)
         if joint:
             log.info("thresholds learn in iterations %d to %d", start + 1, total)
             schedule = JointSchedule(settings, start - resumed + 1)
             options = {"freeze": False, "schedule": schedule}
-        arguments = self.host.saving(self.scratch, total, **self._apart())
+        arguments, began = self.host.saving(self.scratch, total, **self._apart()), time.time() - 0.1
         self._learn(total, arguments, start=resumed, settings=settings, **options)
+        if not joint and start > resumed:
+            self.before = self._model(start, began)
+        elif not joint and file:
+            self.before = starting.model_of(self.adapter, Start(resumed, Path(file), ""))
 
     def _model(self, iteration: int, since: float = 0.0) -> Path | None:
         """The host's PLY of an iteration, or None if the host saved none since this time."""

@@ -93,6 +93,14 @@ def find(adapter: ScriptAdapter, host: HostCommand, output: Path | None) -> Star
     return Start(iteration, path, f"the last file that the host's own training wrote{passed}")
 
 
+def model_of(adapter: ScriptAdapter, start: Start) -> Path | None:
+    """The model in a start, in the output folder that it lies in; None if none was saved there."""
+    path = start.path
+    if path.suffix != ".ply":
+        path = adapter.model_file(path.parent, start.iteration)
+    return path if path.exists() else None
+
+
 def files(adapter: ScriptAdapter, output: Path | None) -> list[tuple[int, Path]]:
     """(iteration, file) of every model in an output folder, the newest last."""
     return adapter.saved_iterations(output) if output else []

@@ -95,7 +95,7 @@ class SessionState:
             so if thresholds learn. One that would draw with thresholds is always proved.
         trust: a proof that fails warns, and the host goes on.
         output: the host's output folder, if it is known.
-        origin: stage 1's output folder, if stage 2 has its own.
+        origin: the file that stage 2 resumes; None if it follows in one run.
     """
 
     stand_ins: StandIns

@@ -185,9 +185,7 @@ def begin_step(session: SessionState, model: Any, state: ModelState) -> None:
     state.begun, state.beside = True, False
     state.steps += 1
     if session.standing_still(model) and not state.prepared:
-        resumed = session.start > 0 or session.origin is not None
-        output = (session.origin or session.output) if resumed else None
-        session.adapter.prepare_stage2(model, output)
+        session.adapter.prepare_stage2(model, session.origin)
         state.prepared = True
     if state.steps >= session.from_step + session.settings.iterations:
         session.held = model

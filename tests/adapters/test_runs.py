@@ -197,12 +197,12 @@ def test_a_host_that_learns_and_draws_nothing_is_always_an_error(photographs, tm
 def test_only_a_resumed_run_restores_the_folders(photographs, tmp_path, monkeypatch, from_iter):
     """What an earlier training left there must not overwrite what this one has trained."""
     told = []
-    monkeypatch.setattr(Vanilla3DGS, "prepare_stage2", lambda self, model, out: told.append(out))
+    monkeypatch.setattr(Vanilla3DGS, "prepare_stage2", lambda self, model, at: told.append(at))
     options = RunOptions(None, "auto", Settings(3), from_iter, device="cpu")
     if from_iter is not None:
         options = replace(options, stage="finetune")
     run(command(photographs, tmp_path / "out", 22), options)
-    assert told == [None if from_iter is not None else tmp_path / "out"]
+    assert told == [None if from_iter is not None else tmp_path / "out" / "chkpnt22.pth"]
 
 
 @pytest.fixture(scope="module")
@@ -224,6 +224,18 @@ def test_resumed_it_learns_from_one(photographs, tmp_path, checkpoint, stage, fr
     options = RunOptions(stage=stage, from_iter=from_iter, device="cpu")
     store, _ = sidecar.load(run(words, options).model_after)
     assert store.steps == learned
+
+
+@pytest.mark.parametrize("from_iter", [12, 15])
+def test_a_model_saved_where_learning_begins_is_that_of_before(
+    photographs, tmp_path, checkpoint, from_iter
+):
+    more = ["--start_checkpoint", checkpoint, "--save_iterations", 15]
+    options = RunOptions(stage="finetune", from_iter=from_iter, device="cpu")
+    summary = run(command(photographs, tmp_path / "out", 20, *more), options)
+    folder = checkpoint.parent if from_iter == 12 else tmp_path / "out"
+    expected = folder / f"point_cloud/iteration_{from_iter}/point_cloud.ply"
+    assert (summary.model_before, summary.not_compared) == (expected, None)
 
 
 @pytest.mark.parametrize("stage", ["joint", "finetune"])

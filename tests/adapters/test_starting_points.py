@@ -1,13 +1,18 @@
 """Where stage 2 starts: the last file of the host's own training; what starts from stage 2."""
 
+import json
 import logging
+import os
 import shutil
+import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
+from fragprune_vanilla_3dgs import Vanilla3DGS
 from miniatures import runs
 from miniatures.vanilla_3dgs import HOST, running
 
@@ -219,3 +224,33 @@ def test_a_checkpoint_that_we_made_comes_to_the_gpu_of_its_model():
         assert {each.device.type for each in (model.denom, model.max_radii2D)} == {"meta"}
         moments = model.optimizer.state[model._xyz]
         assert [moments[k].device.type for k in ("exp_avg", "step")] == ["meta", "cpu"]
+
+
+@pytest.mark.parametrize("named", ["chkpnt10.pth", ply(10)])
+def test_the_model_of_before_lies_where_the_named_start_does(photographs, out, tmp_path, named):
+    """The command's own folder holds no model of that iteration, or another training's."""
+    other, new = tmp_path / "other", tmp_path / "new"
+    run(command(photographs, other, 10, "--lambda_dssim", 0.9), replace(OPTIONS, stage="off"))
+    for folder in (other, new):
+        words = command(photographs, folder, 10, "--start_checkpoint", out / named)
+        summary = run(words, FINETUNE)
+        assert (summary.model_before, summary.not_compared) == (out / ply(10), None)
+
+
+@pytest.mark.parametrize("start", [Path("chkpnt10.pth"), ply(10)])
+def test_exposures_are_those_of_the_start_also_after_stage_two(tmp_path, start):
+    """The host saves them in one file of the folder, which stage 2 writes anew."""
+
+    def begun(gain):
+        rows = {"view": (gain * torch.eye(3, 4)).tolist()}
+        (tmp_path / "exposure.json").write_text(json.dumps(rows))
+        model = SimpleNamespace(exposure_mapping={"view": 0}, _exposure=torch.eye(3, 4)[None])
+        Vanilla3DGS().prepare_stage2(model, tmp_path / start)
+        return float(model._exposure[0, 0, 0])
+
+    (tmp_path / start).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / start).touch()
+    assert [begun(gain) for gain in (2.0, 3.0)] == [2.0, 2.0]
+    later = time.time() + 9
+    os.utime(tmp_path / start, (later, later))  # trained again
+    assert begun(4.0) == 4.0
