@@ -14,7 +14,7 @@ from types import MappingProxyType, ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from fragprune_graphdeco import photographs, plain, reading
-from fragprune_graphdeco.call import RasterizerCall, drawing_functions, read_calls
+from fragprune_graphdeco.call import CallInSource, RasterizerCall, drawing_functions, read_calls
 from fragprune_graphdeco.densifying import clones, splits
 from fragprune_graphdeco.kernels import SPLAT, Kernel, read_kernels, vendored
 from fragprune_graphdeco.reading import every, module_of, text_of
@@ -279,7 +279,7 @@ class GraphdecoAdapter(ScriptAdapter):
     filtered = False
     resumes_ply = True
     undrawn: tuple[str, ...] = ()
-    undrawn_flags: tuple[str, ...] = ("--antialiasing", "--train_test_exp")
+    undrawn_flags: tuple[str, ...] = ("--train_test_exp",)
     flags: ClassVar[Mapping[str, Any]] = MappingProxyType({})
     checkpoints = "chkpnt"
     seams = (
@@ -380,13 +380,17 @@ class GraphdecoAdapter(ScriptAdapter):
 
     def dialect(self, repo: HostRepo) -> GraphdecoDialect:
         """The dialect for the arguments and outputs of the first of ``calls`` in the source."""
-        renderer, accepted = self._accepted()
-        call = next(iter(read_calls(repo, renderer, accepted[0].function)), None)
+        call = self._first_call(repo)
         return self.dialect_type(
             package=self.package,
             settings=call.settings if call else (),
             outputs=(call.outputs if call else None) or 2,
         )
+
+    def _first_call(self, repo: HostRepo) -> CallInSource | None:
+        """The first of ``calls`` in the source."""
+        renderer, accepted = self._accepted()
+        return next(iter(read_calls(repo, renderer, accepted[0].function)), None)
 
     def scripts_of(self, repo: HostRepo) -> tuple[str, ...]:
         """``scripts``; where a checkout has none of them, its own that train one GaussianModel."""
@@ -426,10 +430,18 @@ class GraphdecoAdapter(ScriptAdapter):
     def numbers(
         self, repo: HostRepo, script: Path, arguments: list[str], names: Iterable[str]
     ) -> dict[str, list[int]]:
-        """Numbers of a training command by argument, for those arguments that the source has."""
+        """Numbers of a training command by argument, for those arguments that the source has.
+
+        Raises:
+            UsageError: a value is no number, or the configuration file cannot be read.
+        """
         defaults = {name: numbers(repo, script, name) for name in names}
         known = {name: default for name, default in defaults.items() if default}
-        return self.command_line(repo).numbers(arguments, **known)
+        options = {name: {"type": int, "nargs": "+", "default": known[name]} for name in known}
+        flags = {name: ((f"--{name}",), options[name]) for name in known}
+        found = self.command_line(repo).parsed(arguments, flags)
+        lists = ((name, found[name]) for name in known)
+        return {name: each if isinstance(each, list) else [each] for name, each in lists}
 
     def means(self, model: Any) -> Tensor:
         """``get_xyz`` returns the parameter object itself."""
@@ -483,16 +495,9 @@ class GraphdecoAdapter(ScriptAdapter):
         )
 
     def photographs(self, repo: HostRepo, arguments: list[str]) -> Photographs:
-        """The command's photographs, if it holds views out (``--eval``)."""
+        """The command's photographs, some of which it holds out with ``--eval``."""
         line = self.command_line(repo)
         flags = line.read(arguments)
-        if line.hold_out and not flags.hold_out:
-            raise NotComparedError(
-                "the host's command",
-                f"no {line.hold_out[-1]}: every view is trained on",
-                "views that are held out",
-                f"Train with {line.hold_out[-1]}, from stage 1 on.",
-            )
         source = Path(flags.source or "")
         return Photographs(
             source,
@@ -501,6 +506,7 @@ class GraphdecoAdapter(ScriptAdapter):
             flags.images or "images",
             centred=_centred(repo) or None,
             opaque=_opaque(repo, source),
+            held_out=bool(flags.hold_out) or not line.hold_out,
         )
 
     def not_drawn(self, repo: HostRepo, arguments: list[str]) -> list[str]:
@@ -515,7 +521,7 @@ class GraphdecoAdapter(ScriptAdapter):
         return [f"{flag}, which our readers do not support" for flag in flags] + other
 
     def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any]:
-        """No fields: vanilla's rules apply."""
+        """Vanilla's rules, with the compensation for antialiasing if the command asks for it."""
         if self.undrawn:
             found, remedy = self.undrawn
             raise NotComparedError(self.info.title, found, "models that we can draw", remedy)
@@ -526,7 +532,15 @@ class GraphdecoAdapter(ScriptAdapter):
                 "pictures as the host draws them",
                 "Draw and measure with the host's render.py and metrics.py.",
             )
-        return {}
+        return {"compensation": "antialiasing"} if self._compensated(repo, arguments) else {}
+
+    def _compensated(self, repo: HostRepo, arguments: list[str]) -> bool:
+        """Whether the rasterizer is told to compensate, by an option or always."""
+        call = self._first_call(repo)
+        told = call.given.get("antialiasing") if call else None
+        if isinstance(told, ast.Attribute):
+            return f"--{told.attr}" in arguments or bool(default(repo, told.attr, False))
+        return bool(getattr(told, "value", False))
 
     def model_file(self, output: Path, iteration: int) -> Path:
         """The path to which ``scene.save`` writes."""

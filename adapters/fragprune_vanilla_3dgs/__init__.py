@@ -47,7 +47,7 @@ class Vanilla3DGS(GraphdecoAdapter):
         repo="graphdeco-inria/gaussian-splatting",
         states="mid-July, late July, October 2023 (2-tuple), August 2024 (3-tuple), October 2024 "
         "(separate_sh, sparse Adam)",
-        limits=("fragprune run makes no comparison with --antialiasing or --train_test_exp.",),
+        limits=("fragprune run makes no comparison with --train_test_exp.",),
     )
     calls = (
         RasterizerCall(),

@@ -211,29 +211,15 @@ class CommandLine:
             "resume": {},
         }
         flags = {name: (self.spellings(name), more) for name, more in options.items()}
-        return argparse.Namespace(**self._parsed(arguments, flags))
+        return argparse.Namespace(**self.parsed(arguments, flags))
 
-    def numbers(self, arguments: list[str], **defaults: Sequence[int]) -> dict[str, list[int]]:
-        """Numbers of other flags, by name, as the host will read them.
-
-        Args:
-            defaults: by a flag's name without dashes, the host's default.
-
-        Raises:
-            UsageError: a value is no number, or the configuration file cannot be read.
-        """
-        flags = {
-            name: ((f"--{name}",), {"type": int, "nargs": "+", "default": [*default]})
-            for name, default in defaults.items()
-        }
-        found = self._parsed(arguments, flags)
-        lists = ((name, found[name]) for name in defaults)
-        return {name: each if isinstance(each, list) else [each] for name, each in lists}
-
-    def _parsed(
+    def parsed(
         self, arguments: list[str], flags: Mapping[str, tuple[Sequence[str], dict[str, Any]]]
     ) -> dict[str, Any]:
-        """Values of flags by name, and "config"; what that file says goes before the command."""
+        """Values of flags by name, as the host reads them, and "config".
+
+        What that file says goes before the command; UsageError as of ``read``.
+        """
         parser = Flags(add_help=False, allow_abbrev=False, conflict_handler="resolve")
         for name, (spellings, more) in flags.items():
             if spellings:
@@ -415,7 +401,7 @@ class ScriptAdapter(HostAdapter):
         """The photographs that a training command reads.
 
         Raises:
-            NotComparedError: no view is held out, or our readers would read the images differently.
+            NotComparedError: our readers would read the images differently.
         """
         raise NotComparedError(
             self.name,

@@ -61,6 +61,7 @@ class Photographs:
         images: name of the folder of a COLMAP scene that holds the images.
         centred: whether the principal point is a picture's middle, as in 3DGS; None if unknown.
         opaque: the host drops alpha channels, as 3DGS does of a COLMAP scene.
+        held_out: the host does not train on what is held out here.
     """
 
     folder: Path
@@ -69,3 +70,4 @@ class Photographs:
     images: str = "images"
     centred: bool | None = None
     opaque: bool = False
+    held_out: bool = True

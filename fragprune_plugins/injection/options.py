@@ -72,8 +72,8 @@ class RunSummary(Summary):
         curves: one dict per learned step: step, loss, fragments_per_pixel, pressure,
             threshold_median.
         output: the host's output folder; stage 1's, if stage 2 has its own.
-        photographs: the data set whose held-out views can measure the models; None if they cannot
-            be measured.
+        photographs: the data set whose held-out views, if any, can measure the models; None if
+            they cannot be measured.
         drawing: fields of ``RasterInputs`` with which the host draws its models.
         not_compared: the reason why learned models cannot be compared; otherwise None.
         already_finished: ``model_after`` was there before, and nothing was run.

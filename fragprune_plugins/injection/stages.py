@@ -85,7 +85,7 @@ class Stages:
         """Run stage 1 with a checkpoint at its end, then stage 2 from that checkpoint."""
         if self.host.line.one_run:
             return self.one_run()
-        if self.host.flags.resume and self.host.script.name not in self.host.line.continues:
+        if self.host.flags.resume and not starting.trains_on(self.host):
             return self.finetune()
         self.adapter.resumed_by(self.host.script, self.host.arguments)  # refuse before stage 1
         if not self.options.again:
@@ -159,7 +159,7 @@ class Stages:
         log.info("stage 2: %d iterations from iteration %d, %s: %s", settings.iterations, *start)
         line = self.host.line
         with starting.resumable(self.adapter, line, start) as checkpoint:
-            self.before = starting.model_of(self.adapter, start)
+            self.before = self._model(start.iteration, at=start.path)
             first = 0 if line.restarts else start.iteration
             total = first + settings.iterations + line.skipped
             extra = {"iterations": total, "resume": str(checkpoint)}
@@ -172,8 +172,8 @@ class Stages:
             if kept is not None:
                 extra["resume"] = str(starting.part_of(checkpoint, kept, self.scratch))
             arguments = self.host.saving(self.scratch, total, **extra)
-            origin = {"start": first, "origin": start.path}
-            self._learn(total, arguments, settings=self.settings, **origin)
+            begins = {"start": first, "origin": start.path}
+            self._learn(total, arguments, settings=self.settings, **begins)
 
     def _apart(self, own: str = "") -> dict[str, str]:
         """Save what learns in this folder in the output folder, a control always in one of its own.
@@ -209,23 +209,20 @@ class Stages:
         Args:
             checkpoint: that the host resumes.
         """
-        asked, look = (self.options.settings, None), self.options.look
-        if look is None or self.before is None:
-            return asked
+        settings, before, look = self.options.settings, self.before, self.options.look
+        if look is None or before is None:
+            return settings, None
+        host = self.repo, self.host.arguments
         try:
-            photographs = self.adapter.photographs(self.repo, self.host.arguments)
-            drawing = self.adapter.drawing(self.repo, self.host.arguments)
-        except NotComparedError:
-            return asked
-        if not starting.holds(checkpoint, self.before):
-            log.warning(
-                "%s has other Gaussians than %s, as where a host densifies in its last iteration: "
-                "stage 2 learns as asked, without a look at the model",
-                checkpoint,
-                self.before,
-            )
-            return asked
-        return look(self.before, photographs, drawing, self.options.settings)
+            photographs, drawing = self.adapter.photographs(*host), self.adapter.drawing(*host)
+            if starting.holds(checkpoint, before):
+                return look(before, photographs, drawing, settings)
+            why = f"{checkpoint} has other Gaussians than {before}, as where a host densifies in "
+            why += "its last iteration"
+        except NotComparedError as error:
+            why = f"{error.where}: {error.found}"
+        log.warning("stage 2 learns as asked, without a look at the model: %s", why)
+        return settings, None
 
     def _execute(
         self,
@@ -370,21 +367,23 @@ class Stages:
             remedy = f"{flag}, or lower --from-iter." if start > resumed else f"{flag}."
             raise UsageError(f"--stage {self.options.stage}", found, expected, remedy)
         settings = replace(self.options.settings, iterations=end - (resumed if joint else start))
-        options: dict[str, Any] = {"from_step": start - resumed}
-        if file and start == resumed:
-            options["origin"] = Path(file)
+        origin = Path(file) if file and start == resumed else None
+        options: dict[str, Any] = {"from_step": start - resumed, "origin": origin}
         if joint:
             log.info("thresholds learn in iterations %d to %d", start + 1, total)
             schedule = JointSchedule(settings, start - resumed + 1)
             options = {"freeze": False, "schedule": schedule}
         arguments, began = self.host.saving(self.scratch, total, **self._apart()), time.time() - 0.1
         self._learn(total, arguments, start=resumed, settings=settings, **options)
-        if not joint and start > resumed:
-            self.before = self._model(start, began)
-        elif not joint and file:
-            self.before = starting.model_of(self.adapter, Start(resumed, Path(file), ""))
+        if not joint:
+            self.before = self._model(start, 0.0 if origin else began, origin)
 
-    def _model(self, iteration: int, since: float = 0.0) -> Path | None:
-        """The host's PLY of an iteration, or None if the host saved none since this time."""
-        path = self.adapter.model_file(self.output, iteration) if self.output else None
+    def _model(self, iteration: int, since: float = 0.0, at: Path | None = None) -> Path | None:
+        """The host's PLY of an iteration, or None if the host saved none since this time.
+
+        It is ``at`` itself, or beside that checkpoint, or in the output folder.
+        """
+        folder = at.parent if at else self.output
+        path = self.adapter.model_file(folder, iteration) if folder else None
+        path = at if at and at.suffix == ".ply" else path
         return path if path and path.exists() and path.stat().st_mtime >= since else None

@@ -93,12 +93,12 @@ def find(adapter: ScriptAdapter, host: HostCommand, output: Path | None) -> Star
     return Start(iteration, path, f"the last file that the host's own training wrote{passed}")
 
 
-def model_of(adapter: ScriptAdapter, start: Start) -> Path | None:
-    """The model in a start, in the output folder that it lies in; None if none was saved there."""
-    path = start.path
-    if path.suffix != ".ply":
-        path = adapter.model_file(path.parent, start.iteration)
-    return path if path.exists() else None
+def trains_on(host: HostCommand) -> bool:
+    """Whether the file that a command names is of a training that it has yet to end."""
+    line, path = host.line, Path(host.flags.resume)
+    if path.suffix == ".ply" or line.restarts or host.script.name in line.continues:
+        return host.script.name in line.continues
+    return resumed_at(line, path) < host.iterations and not _learned(path)
 
 
 def files(adapter: ScriptAdapter, output: Path | None) -> list[tuple[int, Path]]:

@@ -12,7 +12,6 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from fragprune_vanilla_3dgs import Vanilla3DGS
 from miniatures import runs
 from miniatures.vanilla_3dgs import HOST, running
 
@@ -20,6 +19,7 @@ from fragprune_plugins import Control, Settings
 from fragprune_plugins.errors import HostFailed, ModelFileError, SidecarError, UsageError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_vanilla_3dgs import Vanilla3DGS
 
 command = partial(runs.command, HOST / "train.py")
 SETTINGS = Settings(iterations=6, threshold_lr=0.3, train="opacity")
@@ -121,6 +121,21 @@ def test_what_the_command_names_is_taken_also_of_stage_two(out, started):
     line = started(out, 10, "--start_checkpoint", out / "chkpnt13.pth")
     assert line.endswith(f"iteration 13, {out / 'chkpnt13.pth'}: the command names it")
     assert sidecar.load(out / ply(20))[0].steps == 3 + learned
+
+
+def test_a_training_that_was_broken_off_is_ended_before_stage_two(photographs, out, started):
+    words = ("--checkpoint_iterations", 5)
+    run(command(photographs, out, 10, *words), replace(OPTIONS, stage="off"))
+    named = ("--start_checkpoint", out / "chkpnt5.pth")
+    line = started(out, 10, *named, options=OPTIONS)
+    assert line.endswith(f"iteration 10, {out / 'chkpnt10.pth'}: the end of stage 1")
+    assert "iteration 5," in started(out, 10, *named)  # stage 2 alone
+    for ended in ("chkpnt10.pth", ply(10)):
+        line = started(out, 10, "--start_checkpoint", out / ended, options=OPTIONS)
+        assert line.endswith(f"iteration 10, {out / ended}: the command names it")
+    started(out, 10, "--checkpoint_iterations", 13)
+    named = ("--start_checkpoint", out / "chkpnt13.pth")
+    assert "iteration 13," in started(out, 30, *named, options=OPTIONS)  # of stage 2
 
 
 def test_a_ply_whose_folder_tells_no_iteration_is_a_usage_error(photographs, out):

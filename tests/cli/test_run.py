@@ -18,6 +18,7 @@ from fragprune_plugins.injection import launch
 from fragprune_plugins.learning.schedule import USUAL_STOP
 from fragprune_plugins.testing import mutations
 from fragprune_plugins.workbench.figures import records
+from fragprune_plugins.workbench.figures.wording import begun
 from fragprune_plugins.workbench.finetune import trial
 from fragprune_plugins.workbench.run import work
 
@@ -207,6 +208,8 @@ def test_a_finished_stage_two_says_so_and_runs_nothing(folder):
     assert f"fragprune compare {models(out)[0]} {result}" in text.stdout
     assert result.stat().st_mtime_ns == written
     assert run_json("run", *finetune, "--pressure", 2e-3, *words)["already_finished"] is False
+    other = run_json("run", *finetune, "--pressure", 2e-3, *words, "--lambda_dssim", 0.5)
+    assert other["already_finished"] is False
 
 
 def test_a_model_that_knows_photographs_by_heart_is_told(scene, tmp_path, monkeypatch):
@@ -281,7 +284,7 @@ def test_compare_follows_the_run_that_left_the_models(trained):
 
 
 def test_what_cannot_be_compared_says_why(scene, tmp_path):
-    words = command(scene, tmp_path / "out")
+    words = command(scene, tmp_path / "out", "--densify_until_iter", 8)
     words.remove("--eval")
     result = run("run", *WORDS, *words)
     assert (
@@ -291,6 +294,10 @@ def test_what_cannot_be_compared_says_why(scene, tmp_path):
     (record,) = records.find(tmp_path / "out")
     assert record.data["before"] is None
     assert record.data["not_compared"]["code"] == "not-compared"
+    assert record.data["gaussians_before"] == record.data["gaussians"] > 0  # it was looked at
+    assert begun(record.data) == []
+    (said,) = begun(record.data | {"keep": 0.6, "gaussians_before": 300})
+    assert "of 300 Gaussians" in said
 
 
 def test_a_host_that_raises_leaves_one_json_object_on_stdout(tmp_path):

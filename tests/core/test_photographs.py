@@ -1,17 +1,22 @@
 """Photographs are read at the size that the host reads them at, or refused."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from finetune import tiny
 from hypothesis import given
 from hypothesis import strategies as st
+from miniatures.runs import edit
+from miniatures.skeletons import skeleton
 
 from fragprune_graphdeco.adapter import resolution
 from fragprune_plugins.adapting import HostRepo, NotComparedError, Photographs, Resolution
 from fragprune_plugins.workbench.demo import work
 from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.figures.records import Recorded, recorded
+from fragprune_plugins.workbench.scenes.dataset import load_photographs
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 HOST = HostRepo(Path(work.__file__).with_name("host"))
@@ -113,9 +118,14 @@ def test_alpha_is_dropped_where_the_host_drops_it(tmp_path, load, colmap, blende
     assert Vanilla3DGS().photographs(HostRepo(tmp_path), words).opaque == blender
 
 
-def test_a_command_that_holds_nothing_out_is_refused():
-    with pytest.raises(NotComparedError, match="no --eval"):
-        Vanilla3DGS().photographs(HOST, ["-s", "scene"])
+def test_a_command_that_holds_nothing_out_learns_from_all(tmp_path):
+    assert command().held_out
+    read = Vanilla3DGS().photographs(HOST, ["-s", str(tiny.scene(tmp_path)[0])])
+    assert not read.held_out
+    held, whole = load_photographs(replace(read, held_out=True)), load_photographs(read)
+    names = [[shot.name for shot in part] for part in (held.train, held.test, whole.train)]
+    assert sorted(names[0] + names[1]) == sorted(names[2])
+    assert whole.test == []
 
 
 @pytest.mark.parametrize(
@@ -127,3 +137,28 @@ def test_photographs_survive_a_record(size, tmp_path):
     path = records.leave(tmp_path / "a.ply", "run", {"photographs": said.as_dict()})
     (record,) = records.find(path.parent)
     assert recorded(record) == said
+
+
+@pytest.mark.parametrize(
+    ("passed", "default", "words", "compensated"),
+    [
+        ("pipe.antialiasing", False, [], False),
+        ("pipe.antialiasing", False, ["--antialiasing"], True),
+        ("pipe.antialiasing", True, [], True),
+        ("pipe.smooth", False, ["--smooth"], True),
+        ("pipe.smooth", False, ["--antialiasing"], False),
+        ("True", False, [], True),
+        ("False", False, ["--antialiasing"], False),
+    ],
+)
+def test_models_are_drawn_with_antialiasing_where_their_host_does(
+    tmp_path, passed, default, words, compensated
+):
+    repo = skeleton(tmp_path, "October 2024")
+    for file, old, new in (
+        ("gaussian_renderer", "antialiasing=0", f"antialiasing={passed}"),
+        ("arguments", "self.iterations", f"self.antialiasing = {default}; self.iterations"),
+    ):
+        edit(tmp_path / file / "__init__.py", old, new)
+    expected = {"compensation": "antialiasing"} if compensated else {}
+    assert Vanilla3DGS().drawing(repo, ["--eval", *words]) == expected

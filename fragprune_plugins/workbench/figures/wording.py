@@ -268,7 +268,9 @@ def begun(data: Mapping[str, Any]) -> list[str]:
         why = "those whose removal changed the training views and views beside them least"
         if keep == "visible":
             why = "which reached no pixel of any view"
-        whole, left = (data[each]["gaussians"] for each in ("before", "after"))
+        measured = data["before"]  # a run whose views all were trained on has none
+        whole = measured["gaussians"] if measured else data["gaussians_before"]
+        left = data["after"]["gaussians"] if measured else data["gaussians"]
         lines.append(f"Removed {whole - left:,} of {whole:,} Gaussians before learning, {why}.")
     return lines
 

@@ -103,11 +103,18 @@ def run(
         warmup = 0 if stage == "joint" else settings.warmup
         with logging_steps([Bar(settings.iterations, warmup)]):
             summary = _launched(host_command, options)
+            if _of_other_options(summary, host_command):
+                log.info("it was learned before by a command with other options: learning again")
+                summary = _launched(host_command, replace(options, stage="finetune", again=True))
         if isinstance(summary, Unserved):
             return train_then_finetune(summary, stage, settings, engine, again=again, json=as_json)
         _expect_thresholds(summary, settings)
         photographs = photographs_of(summary)
         not_compared: FragpruneError | None = summary.not_compared
+        if summary.photographs and not photographs:
+            where, found = "the host's command", "no --eval: every view is trained on"
+            remedy = "Train with --eval, from stage 1 on."
+            not_compared = NotComparedError(where, found, "views that are held out", remedy)
         if photographs:
             try:
                 with current_gpu(engine.device), _enough_memory():
@@ -134,6 +141,14 @@ def _launched(command: Sequence[str], options: launch.RunOptions) -> launch.RunS
         if host is None:
             raise
         return host
+
+
+def _of_other_options(summary: launch.RunSummary | Unserved, command: Sequence[str]) -> bool:
+    """Whether a result that was there before is of a command with other options of the host."""
+    if isinstance(summary, Unserved) or not summary.already_finished or not summary.model_after:
+        return False
+    record = records.beside(summary.model_after)
+    return record is not None and record.data.get("host_options") != _options(command)
 
 
 def _expect_thresholds(summary: launch.RunSummary, settings: Settings) -> None:
@@ -196,6 +211,7 @@ def figures_of(
         "stage": summary.stage,
         "iterations": summary.steps,
         "gaussians": summary.gaussians,
+        "gaussians_before": looking.gaussians,
         "training_views": {
             "fragments_per_pixel_before": summary.fragments_before,
             "fragments_per_pixel_after": summary.fragments_after,
@@ -236,7 +252,7 @@ def _saved(summary: launch.RunSummary) -> str:
 
 def photographs_of(summary: launch.RunSummary) -> records.Recorded | None:
     """How to read the host's data and draw its models; None if they cannot be measured."""
-    if not summary.photographs:
+    if not summary.photographs or not summary.photographs.held_out:
         return None
     left = tuple(path for path in (summary.model_before, summary.model_after) if path)
     return records.Recorded(summary.photographs, left, filtered=True, drawing=summary.drawing)
@@ -285,6 +301,7 @@ def _describe(summary: launch.RunSummary, data: dict[str, Any]) -> str:
     else:
         if data["after"] and not control:
             lines.append(_CONTROL)
+        lines += wording.begun(data)
         if summary.fragments_before and summary.fragments_after:
             lines.append(wording.outcome_in_training(data))
         if data["not_compared"]:
@@ -336,11 +353,13 @@ class Looking:
     """What ``RunOptions.look`` calls; ``trial`` is None where nothing could be tried.
 
     Attributes:
+        gaussians: that the model had.
         seen: the training of stage 1 has seen held-out views.
     """
 
     engine: EngineOptions
     trial: Trial | None = None
+    gaussians: int = 0
     seen: bool = False
 
     def __call__(
@@ -369,7 +388,7 @@ class Looking:
             shots = dataset.train
             views = views_near(shots, seed=settings.seed)
             left = kept(model, trial.keep, shots, views, engine=engine).cpu()
-        self.trial = trial
+        self.trial, self.gaussians = trial, len(model.xyz)
         return trial.settings, left
 
 

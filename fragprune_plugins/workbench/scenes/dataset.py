@@ -266,8 +266,11 @@ class Dataset:
 
 
 def load_photographs(photographs: Photographs) -> Dataset:
-    """Load the photographs of a run with ``load_dataset``."""
-    return load_dataset(**vars(photographs))
+    """Load the photographs of a run with ``load_dataset``; if it holds none out, all train."""
+    read = dict(vars(photographs))
+    held_out = read.pop("held_out")
+    dataset = load_dataset(**read)
+    return dataset if held_out else Dataset([*dataset.train, *dataset.test], [])
 
 
 def load_dataset(
