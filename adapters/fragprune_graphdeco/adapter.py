@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from types import MappingProxyType, ModuleType
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from fragprune_graphdeco import photographs, plain, reading
 from fragprune_graphdeco.call import CallInSource, RasterizerCall, drawing_functions, read_calls
@@ -103,6 +103,8 @@ MODEL_SEAMS: tuple[Seam, ...] = (
     model_seam(Role.RESTORE, "restore", "model_args", "training_args", how=completed),
 )
 
+
+Value = TypeVar("Value", float, str)
 
 SCREEN = 3
 """Columns of the tensor that gets the gradient on the screen."""
@@ -502,11 +504,11 @@ class GraphdecoAdapter(ScriptAdapter):
         return Photographs(
             source,
             resolution(repo, flags.resolution),
-            bool(flags.white_background),
-            flags.images or "images",
+            bool(flags.white_background or default(repo, "_white_background", False)),
+            flags.images or default(repo, "_images", "images"),
             centred=_centred(repo) or None,
             opaque=_opaque(repo, source),
-            held_out=bool(flags.hold_out) or not line.hold_out,
+            held_out=bool(flags.hold_out or default(repo, "eval", False)) or not line.hold_out,
         )
 
     def not_drawn(self, repo: HostRepo, arguments: list[str]) -> list[str]:
@@ -615,10 +617,11 @@ def resolution(repo: HostRepo, asked: int | None) -> Resolution:
     return Resolution.asked(value, divisors)
 
 
-def default(repo: HostRepo, name: str, otherwise: float) -> float:
-    """A number that an argument group assigns to ``self.name``; else ``otherwise``."""
+def default(repo: HostRepo, name: str, otherwise: Value) -> Value:
+    """A number or text that an argument group assigns to ``self.name``; else ``otherwise``."""
+    kinds = (str,) if isinstance(otherwise, str) else (int, float)
     values = (getattr(each, "value", None) for each in reading.defaults(repo, "arguments", name))
-    return next((each for each in values if isinstance(each, int | float)), otherwise)
+    return next((each for each in values if isinstance(each, kinds)), otherwise)
 
 
 def numbers(repo: HostRepo, script: Path, name: str) -> list[int]:

@@ -89,6 +89,21 @@ def test_folder_background_and_images_are_the_commands():
     assert not command().white_background
 
 
+def test_what_a_command_leaves_out_is_the_hosts_own(tmp_path):
+    shutil.copytree(HOST.root, tmp_path, dirs_exist_ok=True)
+    source = tmp_path / "arguments" / "__init__.py"
+    for name, usual, own in (
+        ("_images", '"images"', '"images_8"'),
+        ("_white_background", "False", "True"),
+        ("eval", "False", "True"),
+    ):
+        edit(source, f"self.{name} = {usual}", f"self.{name} = {own}")
+    read = Vanilla3DGS().photographs(HostRepo(tmp_path), ["-s", "scene"])
+    assert (read.images, read.white_background, read.held_out) == ("images_8", True, True)
+    named = Vanilla3DGS().photographs(HostRepo(tmp_path), ["-s", "scene", "-i", "images"])
+    assert named.images == "images"
+
+
 def test_the_middle_is_the_principal_point_of_a_host_that_reads_no_other(tmp_path):
     assert command().centred
     shutil.copytree(HOST.root, tmp_path, dirs_exist_ok=True)
