@@ -13,6 +13,7 @@ import fragprune_plugins as fp
 from fragprune_plugins import RasterInputs
 from fragprune_plugins.errors import DatasetError, ModelFileError
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
+from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.finetune import work
 from fragprune_plugins.workbench.models.formats.ply import write_ply
 from fragprune_plugins.workbench.scenes import generated
@@ -260,6 +261,21 @@ def test_figures_of_a_model_with_exposures_say_that_they_are_left_out(output):
             said = [each for each in run_json(*words)["warnings"] if "view03" in each]
             assert bool(said) == warned
     assert not run_json("profile", output, "--self")["warnings"]
+
+
+def test_a_model_is_drawn_as_the_record_of_its_run_says(output, data, tmp_path, caplog):
+    model = newest_model(output)
+    words, pictures = ("render", model, "--data", data, "--out", tmp_path / "p"), []
+    for drawing in ({}, {"compensation": "antialiasing"}):
+        said = records.Recorded(Photographs(data), (model,), drawing=drawing).as_dict()
+        records.leave(model, "run", {"photographs": said})
+        assert run(*words).exit_code == 0
+        pictures.append(np.asarray(Image.open(next((tmp_path / "p").glob("*.png"))), int))
+        psnr = run_json("profile", model, "--data", data)["psnr"]
+        assert psnr == run_json("compare", model, model, "--data", data)["a"]["psnr"]
+    assert np.abs(pictures[0] - pictures[1]).max() > 2
+    run("view", model, "--out", tmp_path / "view.html")
+    assert "trained with antialiasing, and is drawn here as 3DGS draws" in caplog.text
 
 
 def test_photographs_that_are_learned_from_too_are_not_said_to_be_held_out(model, tmp_path):

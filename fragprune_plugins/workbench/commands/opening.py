@@ -23,7 +23,13 @@ from fragprune_plugins.workbench.ranks import launched, local_rank
 from fragprune_plugins.workbench.scenes.cameras import divided, load_cameras, load_scene_cameras
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 from fragprune_plugins.workbench.scenes.generated import around, own_pictures
-from fragprune_plugins.workbench.scenes.output import ARGUMENTS, cameras_of, over_white, trained_on
+from fragprune_plugins.workbench.scenes.output import (
+    ARGUMENTS,
+    cameras_of,
+    output_folder,
+    over_white,
+    trained_on,
+)
 
 
 def bound_threads(threads: int | None) -> None:
@@ -92,10 +98,19 @@ def _recorded(model: Path) -> Photographs | None:
 
 
 def as_trained(model: Path) -> tuple[bool, Mapping[str, Any]]:
-    """The ``filtered`` and the ``drawing`` of a model, by the record of the run that trained it."""
+    """The ``filtered`` and the ``drawing`` of a model, by the record of the run that trained it.
+
+    A model that is newer than a record elsewhere in its folder is of another training.
+    """
+    written, folder = model.stat().st_mtime_ns, output_folder(model)
     with contextlib.suppress(RecordError):
-        if (record := records.beside(model)) and (read := records.recorded(record)):
-            return read.filtered, read.drawing
+        found = records.find(folder) if folder else [records.beside(model)]
+        for record in filter(None, reversed(found)):
+            read, path = records.recorded(record), record.path
+            own = read and model.resolve() in [each.resolve() for each in read.models]
+            current = path.parent == model.parent or path.stat().st_mtime_ns >= written
+            if read and own and current:
+                return read.filtered, read.drawing
     return False, {}
 
 
