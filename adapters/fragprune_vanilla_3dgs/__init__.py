@@ -9,9 +9,10 @@ before mid-July 2023 have no checkpoints, so stage 2 is not possible.
 from __future__ import annotations
 
 import contextlib
+import re
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import fragprune_graphdeco as graphdeco
 from fragprune_3dgs_fork import ForkAdapter
@@ -23,8 +24,13 @@ from fragprune_plugins.adapting import (
     HostRepo,
     ModelFileError,
     Role,
+    SeamCall,
     UntrustedFile,
+    revised,
 )
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 _EXPOSURES = UntrustedFile(
     ModelFileError,
@@ -35,6 +41,38 @@ _EXPOSURES = UntrustedFile(
 
 OUTPUTS = 3
 """Colour, radii and, since August 2024, inverse depth."""
+
+
+_KEPT = ".exposure.json"
+"""Exposures beside a PLY: those that it had before stage 2 wrote its own over them."""
+
+
+def _kept(ply: Path) -> Path | None:
+    """The file of exposures that is kept beside a PLY; None if there is none of this PLY."""
+    path = ply.with_suffix(_KEPT)
+    there = path.exists() and ply.exists() and path.stat().st_mtime_ns >= ply.stat().st_mtime_ns
+    return path if there else None
+
+
+def _exposures(file: Path) -> dict[str, Tensor]:
+    """A (3, 4) matrix for each photograph, by its name."""
+    import torch
+
+    found = {}
+    with _EXPOSURES.reading(file) as reading:
+        for image, rows in reading.json().items():
+            reading.place = image
+            found[image] = torch.tensor(rows).reshape(3, 4)
+    return found
+
+
+def _loaded(call: SeamCall) -> Path:
+    """The file that was read; its model is shown under the exposures that it was trained with."""
+    path, shown = Path(call.first), getattr(call.model, "pretrained_exposures", None)
+    if shown and (kept := _kept(path)):
+        for image, exposure in _exposures(kept).items():
+            shown[image] = exposure.to(shown.get(image, exposure))
+    return path
 
 
 class Vanilla3DGS(GraphdecoAdapter):
@@ -53,6 +91,8 @@ class Vanilla3DGS(GraphdecoAdapter):
         RasterizerCall(),
         RasterizerCall(frozenset({"antialiasing"}), OUTPUTS, arguments=frozenset({"dc"})),
     )
+
+    seams = revised(GraphdecoAdapter.seams, {"GaussianModel.load_ply": {"how": _loaded}})
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
         """Check the source, as of a fork too; a finding names the revision."""
@@ -106,26 +146,27 @@ class Vanilla3DGS(GraphdecoAdapter):
     def prepare_stage2(self, model: Any, start: Path | None) -> None:
         """Restore exposures, which the host's checkpoint lacks.
 
-        Stage 2 writes its own over them. So a copy stays with the start, for the next stage 2.
+        Stage 2 writes its own over them, so they are kept beside the PLY of the start.
         """
         import torch
 
         mapping = getattr(model, "exposure_mapping", None)
         if not mapping or start is None:
             return
-        folder = start.absolute().parents[2 if start.suffix == ".ply" else 0]
-        file, copy = folder / "exposure.json", start.with_suffix(".exposure.json")
-        kept = copy.exists() and copy.stat().st_mtime_ns >= start.stat().st_mtime_ns
-        file = copy if kept else file
-        if not file.exists():
+        ply, folder = start.absolute(), start.absolute().parent
+        if ply.suffix == ".ply":
+            folder = ply.parents[2]
+        else:
+            ply = self.model_file(folder, int(re.sub(r"\D", "", start.stem)))
+        kept = _kept(ply)
+        if kept is None and not (folder / "exposure.json").exists():
             return
-        with _EXPOSURES.reading(file) as reading, torch.no_grad():
-            saved = reading.json()
+        saved = _exposures(kept or folder / "exposure.json")
+        with torch.no_grad():
             for image, row in mapping.items():
                 if image in saved:
-                    reading.place = image
-                    model._exposure[row] = torch.tensor(saved[image]).to(model._exposure)
+                    model._exposure[row] = saved[image].to(model._exposure)
             neutral = torch.eye(3, 4).to(model._exposure)
-        if not kept and bool((model._exposure != neutral).any()):
-            with contextlib.suppress(OSError):  # of a folder of somebody else
-                shutil.copy(file, copy)
+        if kept is None and bool((model._exposure != neutral).any()):
+            with contextlib.suppress(OSError):  # of somebody else's folder
+                shutil.copy(folder / "exposure.json", ply.with_suffix(_KEPT))

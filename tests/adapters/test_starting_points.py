@@ -18,6 +18,7 @@ from miniatures.vanilla_3dgs import HOST, running
 from fragprune_plugins import Control, Settings
 from fragprune_plugins.errors import HostFailed, ModelFileError, SidecarError, UsageError
 from fragprune_plugins.files import sidecar
+from fragprune_plugins.hosts.seams import Role, SeamCall
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
@@ -252,20 +253,32 @@ def test_the_model_of_before_lies_where_the_named_start_does(photographs, out, t
         assert (summary.model_before, summary.not_compared) == (out / ply(10), None)
 
 
-@pytest.mark.parametrize("start", [Path("chkpnt10.pth"), ply(10)])
-def test_exposures_are_those_of_the_start_also_after_stage_two(tmp_path, start):
+def test_exposures_are_those_of_the_start_also_after_stage_two(tmp_path):
     """The host saves them in one file of the folder, which stage 2 writes anew."""
+    starts = [tmp_path / "chkpnt10.pth", tmp_path / ply(10)]
 
-    def begun(gain):
+    def begun(gain, start):
         rows = {"view": (gain * torch.eye(3, 4)).tolist()}
         (tmp_path / "exposure.json").write_text(json.dumps(rows))
         model = SimpleNamespace(exposure_mapping={"view": 0}, _exposure=torch.eye(3, 4)[None])
-        Vanilla3DGS().prepare_stage2(model, tmp_path / start)
+        Vanilla3DGS().prepare_stage2(model, start)
         return float(model._exposure[0, 0, 0])
 
-    (tmp_path / start).parent.mkdir(parents=True, exist_ok=True)
-    (tmp_path / start).touch()
-    assert [begun(gain) for gain in (2.0, 3.0)] == [2.0, 2.0]
+    def shown():
+        model = SimpleNamespace(pretrained_exposures={"view": torch.eye(3, 4)})
+        load = next(seam for seam in Vanilla3DGS.seams if seam.role is Role.LOAD)
+        call = SeamCall(load, lambda path: None, model, (str(starts[1]),), {})
+        call.model = model
+        assert call.how() == starts[1]
+        return float(model.pretrained_exposures["view"][0, 0])
+
+    starts[1].parent.mkdir(parents=True)
+    for each in starts:
+        each.touch()
+    assert shown() == 1.0
+    assert [begun(gain, starts[gain % 2]) for gain in (2, 3, 4)] == [2.0, 2.0, 2.0]
+    assert shown() == 2.0
     later = time.time() + 9
-    os.utime(tmp_path / start, (later, later))  # trained again
-    assert begun(4.0) == 4.0
+    os.utime(starts[1], (later, later))  # trained again
+    assert shown() == 1.0
+    assert begun(5, starts[0]) == 5.0
