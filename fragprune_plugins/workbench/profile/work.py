@@ -62,8 +62,7 @@ def profile(
     }
     lines = [describe(profiled(report)), *(f"Warning: {each}" for each in warnings)]
     if loaded.falloff is not None:
-        points = (0.05, 0.25, 0.5, 0.75, 0.95)
-        quantiles = np.quantile(loaded.falloff.cpu().numpy(), points).tolist()
+        quantiles = np.quantile(loaded.falloff.cpu(), [0.05, 0.25, 0.5, 0.75, 0.95]).tolist()
         report["threshold_quantiles"] = quantiles
         lines.append(
             "Cutoffs as falloffs, 1 at a Gaussian's centre, 0 far outside (5, 25, 50, 75, 95 %): "

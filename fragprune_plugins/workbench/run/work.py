@@ -103,18 +103,11 @@ def run(
         warmup = 0 if stage == "joint" else settings.warmup
         with logging_steps([Bar(settings.iterations, warmup)]):
             summary = _launched(host_command, options)
-            if _of_other_options(summary, host_command):
-                log.info("it was learned before by a command with other options: learning again")
-                summary = _launched(host_command, replace(options, stage="finetune", again=True))
         if isinstance(summary, Unserved):
             return train_then_finetune(summary, stage, settings, engine, again=again, json=as_json)
         _expect_thresholds(summary, settings)
         photographs = photographs_of(summary)
-        not_compared: FragpruneError | None = summary.not_compared
-        if summary.photographs and not photographs:
-            where, found = "the host's command", "no --eval: every view is trained on"
-            remedy = "Train with --eval, from stage 1 on."
-            not_compared = NotComparedError(where, found, "views that are held out", remedy)
+        not_compared = _not_compared(summary)
         if photographs:
             try:
                 with current_gpu(engine.device), _enough_memory():
@@ -134,7 +127,11 @@ def run(
 def _launched(command: Sequence[str], options: launch.RunOptions) -> launch.RunSummary | Unserved:
     """The command run under its adapter; what there is to run where none fits."""
     try:
-        return launch.run(list(command), options)
+        summary = launch.run(list(command), options)
+        if _of_other_options(summary, command):
+            log.info("it was learned before by a command with other options: learning again")
+            summary = launch.run(list(command), replace(options, stage="finetune", again=True))
+        return summary
     except UnknownHostError:
         after = options.stage in ("auto", "finetune") and options.from_iter is None
         host = unserved(command) if after and options.adapter is None else None
@@ -143,12 +140,21 @@ def _launched(command: Sequence[str], options: launch.RunOptions) -> launch.RunS
         return host
 
 
-def _of_other_options(summary: launch.RunSummary | Unserved, command: Sequence[str]) -> bool:
+def _of_other_options(summary: launch.RunSummary, command: Sequence[str]) -> bool:
     """Whether a result that was there before is of a command with other options of the host."""
-    if isinstance(summary, Unserved) or not summary.already_finished or not summary.model_after:
+    if not summary.already_finished or not summary.model_after:
         return False
     record = records.beside(summary.model_after)
     return record is not None and record.data.get("host_options") != _options(command)
+
+
+def _not_compared(summary: launch.RunSummary) -> FragpruneError | None:
+    """Why its models are not measured on held-out views; None if they can be."""
+    if summary.photographs is None or summary.photographs.held_out:
+        return summary.not_compared
+    where, found = "the host's command", "no --eval: every view is trained on"
+    remedy = "Train with --eval, from stage 1 on."
+    return NotComparedError(where, found, "views that are held out", remedy)
 
 
 def _expect_thresholds(summary: launch.RunSummary, settings: Settings) -> None:
