@@ -283,6 +283,19 @@ def test_compare_follows_the_run_that_left_the_models(trained):
     assert ", 40x30 pixels" in run("compare", *models(out), "--resolution", 1).stdout
 
 
+def test_a_stage_two_that_reads_photographs_otherwise_than_stage_one_says_so(
+    scene, tmp_path, caplog
+):
+    out = tmp_path / "out"
+    more = ("--densify_until_iter", 8)
+    assert run("run", *WORDS, *command(scene, out, *more, "-w", "-i", "images")).exit_code == 0
+    assert "its training had another" not in caplog.text
+    words = command(scene, out, *more, "-r", 2)
+    words.remove("--eval")
+    assert run("run", "--stage", "finetune", *WORDS, *words).exit_code == 0
+    assert "its training had another resolution, white_background, eval (cfg_args)" in caplog.text
+
+
 def test_what_cannot_be_compared_says_why(scene, tmp_path):
     words = command(scene, tmp_path / "out", "--densify_until_iter", 8)
     words.remove("--eval")

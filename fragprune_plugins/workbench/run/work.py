@@ -51,7 +51,7 @@ from fragprune_plugins.workbench.run.sweep import run_sweep
 from fragprune_plugins.workbench.run.unserved import Unserved, unserved
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
 from fragprune_plugins.workbench.scenes.generated import views_near
-from fragprune_plugins.workbench.scenes.output import saw_all
+from fragprune_plugins.workbench.scenes.output import read_otherwise, saw_all
 from fragprune_plugins.workbench.scenes.training import saw_held_out
 
 _WHERE = {"joint": "inside the training"}
@@ -373,6 +373,9 @@ class Looking:
     ) -> tuple[Settings, Tensor | None]:
         """Make the trial of ``fragprune finetune``, and score the Gaussians as it does."""
         self.seen = saw_all(ply)  # stage 2 writes its own arguments over those of stage 1
+        if other := read_otherwise(ply, photographs):
+            said = "%s: its training had another %s (cfg_args); stage 2 learns by this command"
+            log.warning(said, ply, ", ".join(other))
         try:
             with _enough_memory():
                 return self._look(ply, photographs, drawing, settings)

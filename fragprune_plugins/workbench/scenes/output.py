@@ -95,6 +95,16 @@ def saw_all(model: Path) -> bool:
     return False
 
 
+def read_otherwise(model: Path, now: Photographs) -> list[str]:
+    """Arguments by which the training of a model read its photographs otherwise."""
+    with contextlib.suppress(DatasetError):
+        then, held_out = _arguments(model) or (now, now.held_out)
+        names = ("images", "resolution", "white_background")
+        other = [name for name in names if getattr(then, name) != getattr(now, name)]
+        return other + ["eval"] * (held_out and not now.held_out)
+    return []
+
+
 def _arguments(model: Path) -> tuple[Photographs, bool] | None:
     """The photographs of a model's training, and whether it held views out; None if not known."""
     folder = output_folder(model)
