@@ -8,12 +8,19 @@ from types import SimpleNamespace
 import pytest
 import scenes
 import torch
+from packaging.requirements import Requirement
 
 from fragprune_plugins import engines
 from fragprune_plugins.engines.cuda import comparison, driver, kernels, self_check
 from fragprune_plugins.engines.cuda.self_check import Verdict, check_in_subprocess, why_not
 from fragprune_plugins.errors import EngineError, KernelError
 
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+ROOT = Path(__file__).parents[2]
 AGREES = Verdict("agrees")
 FAILS = Verdict("fails", "it crashed")
 COULD_NOT_RUN = Verdict("could not run", "CUDA-capable device(s) is/are busy or unavailable")
@@ -182,6 +189,15 @@ def test_a_gpu_that_is_another_process_s_could_not_be_tried(monkeypatch, capsys)
 def test_the_extra_of_torchs_own_cuda_is_named(monkeypatch, cuda, extra):
     monkeypatch.setattr(torch.version, "cuda", cuda)
     assert extra in driver.remedy()
+
+
+def test_the_extra_without_a_version_takes_the_bindings_that_torch_brings():
+    """Torch 2.10 pins the first, and 2.13 the second: pip would replace torch for another one."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    needs = map(Requirement, project["optional-dependencies"]["cuda"])
+    (taken,) = (each.specifier for each in needs if each.name == "cuda-bindings")
+    assert "12.9.4" in taken
+    assert "13.0.3" in taken
 
 
 # ---- what auto does then -----------------------------------------------------------------------
