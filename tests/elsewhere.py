@@ -12,6 +12,7 @@ from dataclasses import is_dataclass, replace
 from typing import Any
 
 import torch
+from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
@@ -41,6 +42,21 @@ class Elsewhere(torch.Tensor):
     @classmethod
     def __torch_dispatch__(cls, operation: Any, types: Any, args: Any = (), kwargs: Any = None):
         return _run(operation, args, kwargs or {})
+
+
+class TensorFloat32(TorchFunctionMode):
+    """Inside, matrices are multiplied as a GPU may: 10 bits of each factor are left (TF32)."""
+
+    def __torch_function__(self, operation: Any, types: Any, args: Any = (), kwargs: Any = None):
+        if operation.__name__ in ("matmul", "__matmul__", "mm", "bmm", "einsum"):
+            args = tree_map(_ten_bits, args)
+        return operation(*args, **(kwargs or {}))
+
+
+def _ten_bits(value: Any) -> Any:
+    if not isinstance(value, torch.Tensor) or value.dtype is not torch.float32:
+        return value
+    return (value.detach().contiguous().view(torch.int32) & -(1 << 13)).view(torch.float32)
 
 
 class _Everything(TorchDispatchMode):

@@ -155,7 +155,11 @@ class GraphdecoDialect(Dialect):
     def features(self, call: HostCall) -> Tensor | None:
         """(N, F) what is blended beside the colours: depth, if the call returns it."""
         view = call.settings.viewmatrix if "depth" in self.values(call) else None
-        return None if view is None else call["means3D"] @ view[:3, 2:3] + view[3, 2]
+        if view is None:
+            return None
+        z = call["means3D"] * view[:3, 2]  # no product of matrices, as in likeness
+        depth: Tensor = z.sum(1, keepdim=True) + view[3, 2]
+        return depth
 
     def unpack(self, call: HostCall) -> RasterInputs:
         """Translate the call. The host's matrices are already transposed for row vectors."""

@@ -112,8 +112,9 @@ class Seen:
 
 
 def _depths(splats: Splats, view: View) -> Tensor:
-    """(N, 1) z of the means in view space."""
-    return splats.means @ view.viewmatrix[:3, 2:3] + view.viewmatrix[3, 2]
+    """(N, 1) z of the means in view space; no product of matrices, which may be one of TF32."""
+    z = splats.means * view.viewmatrix[:3, 2]
+    return z.sum(1, keepdim=True) + view.viewmatrix[3, 2]
 
 
 def _depth(seen: Seen) -> Tensor | None:
@@ -146,14 +147,12 @@ def _median_depth(seen: Seen) -> Tensor | None:
     depths = _depths(splats, view)
     plain = replace(splats, features=torch.cat([torch.ones_like(depths), depths], 1))
     near, opaque = (1 + 1e-5) * max(seen.inputs.near, 1e-3), 1 - (2 * TRANSMITTANCE_MIN) ** 0.5
-    ahead = torch.tensor([[0.0, 0.0, near, 1.0]]).double() @ torch.linalg.inv(
-        view.viewmatrix.double().cpu()
-    )
+    to_world, like = torch.linalg.inv(view.viewmatrix.double().cpu()), splats.means
     veil = {
-        "means": ahead[:, :3],
-        "scales": torch.full((1, 3), 2e5 * near * max(view.tan_fov_x, view.tan_fov_y)),
-        "rotations": torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
-        "opacities": torch.tensor([opaque]),
+        "means": (near * to_world[2] + to_world[3])[None, :3],
+        "scales": like.new_full((1, 3), 2e5 * near * max(view.tan_fov_x, view.tan_fov_y)),
+        "rotations": like.new_tensor([[1.0, 0.0, 0.0, 0.0]]),
+        "opacities": like.new_tensor([opaque]),
     }
     own = {name: each for name, each in vars(plain).items() if isinstance(each, Tensor)}
     rows = {name: veil.get(name, torch.zeros_like(each[:1])).to(each) for name, each in own.items()}
@@ -182,7 +181,8 @@ def _normals(seen: Seen, *signs: int) -> Tensor | None:
     away = (normals * (splats.means - view.campos)).sum(1, keepdim=True) > 0
     normals = torch.where(away, -normals, normals)
     if signs:
-        normals = normals @ view.viewmatrix[:3, :3] * torch.tensor(signs).to(normals)
+        turned = (normals[:, :, None] * view.viewmatrix[:3, :3]).sum(1)  # as _depths
+        normals = turned * normals.new_tensor(signs)
     return seen.draw(replace(seen.inputs, splats=replace(splats, features=normals))).features
 
 

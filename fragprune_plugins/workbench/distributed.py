@@ -201,8 +201,9 @@ def reaching(inputs: RasterInputs, splats: Splats, thresholds: Tensor | None) ->
     """
     view, means = inputs.view, splats.means
     rotation = view.viewmatrix[:3, :3]
-    x, y, depth = (means @ rotation + view.viewmatrix[3, :3]).unbind(1)
-    clip = means @ view.projmatrix[:3] + view.projmatrix[3]
+    spread = means[:, :, None]  # no products of matrices, which may be those of TF32
+    x, y, depth = ((spread * rotation).sum(1) + view.viewmatrix[3, :3]).unbind(1)
+    clip = (spread * view.projmatrix[:3]).sum(1) + view.projmatrix[3]
     q = 2 * (splats.opacities / ALPHA_MIN).log()
     if thresholds is not None and inputs.rim == "hard":  # a soft one reaches farther
         rim = (thresholds - RIM_REACH * RIM_WIDTH).clamp_min(FALLOFF_MIN)

@@ -4,10 +4,12 @@ from collections import namedtuple
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import scenes
 import torch
+from elsewhere import TensorFloat32
 
 from fragprune_3dgs_fork import ForkDialect, plane_depth
 from fragprune_3dgs_fork.fork import Fork, Output
@@ -233,6 +235,35 @@ def test_only_the_first_picture_of_a_view_in_a_step_is_pressed():
         assert not further_picture(state, 5, 0)
     state.steps = 2
     assert not further_picture(state, 5, 0)
+
+
+def test_no_depth_and_no_normal_is_left_to_tf32(scene, objects):
+    """A host may let torch multiply a GPU's matrices so, and its own rasterizer does not."""
+
+    def blended_besides():
+        inputs = DIALECT.unpack(call_of(scene, objects))
+        seen = likeness.Seen(inputs, inputs, lambda each: each.splats)
+        normals = likeness.MEANINGS["normals in view space"](seen)
+        return torch.cat(
+            [inputs.splats.features, likeness.widened(inputs).splats.features, normals], 1
+        )
+
+    expected = blended_besides()
+    with TensorFloat32():
+        torch.testing.assert_close(blended_besides(), expected)
+
+
+def test_a_median_depth_is_made_where_a_host_makes_tensors_elsewhere(scene):
+    """On a GPU by default, where the veil's place is computed on the CPU."""
+
+    def last_means(inputs):
+        return SimpleNamespace(features=inputs.splats.means[-2:, :1, None])
+
+    seen = likeness.Seen(scene, scene, last_means)
+    expected = likeness.MEANINGS["median depth"](seen)
+    with torch.device("meta"):
+        found = likeness.MEANINGS["median depth"](seen)
+    assert torch.equal(found, expected)
 
 
 @pytest.mark.parametrize("seed", range(12))

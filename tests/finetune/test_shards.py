@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from elsewhere import TensorFloat32
 from finetune import tiny
 from finetune.several import CASES, STEPS, learn
 from hypothesis import given
@@ -198,6 +199,14 @@ def test_what_is_sent_ends_where_fragments_and_rims_end():
         assert moved <= set(reaching(inputs, inputs.splats, cut).tolist())
     sent = reaching(inputs, inputs.splats, None)
     assert set(drawn.tolist()) <= set(sent.tolist())
+    away, shift = torch.tensor([900.0, -700.0, 400.0]), torch.eye(4)  # far from the world's origin
+    shift[3, :3] = -away
+    matrices = {k: shift @ getattr(inputs.view, k) for k in ("viewmatrix", "projmatrix")}
+    far = replace(inputs, view=replace(inputs.view, **matrices))
+    moved_there = replace(inputs.splats, means=inputs.splats.means + away)
+    sent = reaching(far, moved_there, None)
+    with TensorFloat32():  # where a user lets torch multiply a GPU's matrices so
+        assert torch.equal(reaching(far, moved_there, None), sent)
     assert len(drawn) > count / 8
     assert len(sent) - len(drawn) < count / 10  # and few that draw nothing
 
