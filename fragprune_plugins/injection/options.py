@@ -64,11 +64,8 @@ class RunSummary(Summary):
     """The result of a run; without a step where nothing learned.
 
     Attributes:
-        device: "cpu", "cuda" or "cuda:N".
-        stage: the stage of ``RunOptions``.
         model_before: the host's PLY of stage 1, if there is one.
         model_after: the host's PLY after stage 2; its sidecar lies beside it.
-        train_seconds: wall time of both stages.
         curves: one dict per learned step: step, loss, fragments_per_pixel, pressure,
             threshold_median.
         output: the host's output folder; stage 1's, if stage 2 has its own.

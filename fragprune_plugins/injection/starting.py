@@ -169,12 +169,16 @@ def resumable(adapter: ScriptAdapter, line: CommandLine, start: Start) -> Iterat
 def holds(start: Path, ply: Path) -> bool:
     """Whether a file that the host can resume holds the Gaussians of a PLY of the same iteration.
 
-    Hosts write the PLY of an iteration before they densify in it, and the checkpoint after that.
+    Hosts write the PLY of an iteration before they densify in it, or relocate, and the checkpoint
+    after that.
     """
     if start.suffix == ".ply":
         return True
-    rows = len(PlyData.read(ply)["vertex"].data)
-    return any(each.shape[:1] == (rows,) for each in tensors_of(_read_checkpoint(start)[0]))
+    rows = PlyData.read(ply)["vertex"].data
+    xyz = torch.stack([torch.from_numpy(rows[each].copy()) for each in "xyz"], dim=1)
+    far = 0.01 * (xyz - xyz.median(dim=0).values).abs().median()  # no step moves one as far
+    same = (each for each in tensors_of(_read_checkpoint(start)[0]) if each.shape == xyz.shape)
+    return any(bool(((each - xyz).abs() <= far).all()) for each in same)
 
 
 def part_of(start: Path, kept: Tensor, folder: Path) -> Path:

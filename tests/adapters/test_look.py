@@ -126,6 +126,19 @@ def test_a_checkpoint_of_other_gaussians_than_the_ply_resumes_whole(photographs,
     assert summary.gaussians > len(read_ply(summary.model_before).xyz)
 
 
+def test_a_checkpoint_whose_rows_are_other_gaussians_resumes_whole(trained, caplog):
+    """3DGS-MCMC relocates in place: as many rows, some of them elsewhere."""
+    checkpoint, look = Path(trained[4]) / "chkpnt10.pth", Looked()
+    capture, iteration = torch.load(checkpoint, weights_only=False)
+    with torch.no_grad():
+        capture[1][3] += capture[1].max()
+    torch.save((capture, iteration), checkpoint)
+    summary = run(trained, replace(OPTIONS, stage="finetune", look=look))
+    assert look.seen == []
+    assert "other Gaussians" in caplog.text
+    assert summary.gaussians == len(capture[1])
+
+
 def test_a_control_is_looked_at_as_its_training_is(trained):
     control = replace(OPTIONS.settings, goal=Control())
     options = replace(OPTIONS, stage="finetune", settings=control, look=Looked())
