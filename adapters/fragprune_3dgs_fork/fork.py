@@ -7,6 +7,7 @@ import re
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, partial
+from typing import Any
 
 import fragprune_graphdeco as graphdeco
 from fragprune_3dgs_fork import rasterizer
@@ -525,7 +526,9 @@ def plain_distances(repo: HostRepo) -> bool:
 
 def _assigned(body: ast.AST, owner: str = "") -> Iterator[tuple[ast.AST, str]]:
     """What assigns a parameter of a model, or changes its values in place."""
-    for node in nodes(body):
+    kinds = (ast.Assign, ast.AugAssign, ast.AnnAssign, ast.Call)
+    changing: tuple[Any, ...] = every(body, *kinds)
+    for node in changing:
         targets: list[ast.expr] = []
         if isinstance(node, ast.Assign):
             targets = node.targets

@@ -6,6 +6,8 @@ import ast
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any
 
 from fragprune_graphdeco.reading import assigned, every, text_of
 from fragprune_plugins.adapting import Function, HostRepo, nodes
@@ -106,19 +108,20 @@ def _makes_settings(repo: HostRepo, module: str, function: Function) -> bool:
     return any(imported.of(each, SETTINGS) for each in nodes(function))
 
 
-def read_calls(repo: HostRepo, module: str, function: str) -> list[CallInSource]:
+@lru_cache(maxsize=64)  # of the adapters, many ask
+def read_calls(repo: HostRepo, module: str, function: str) -> tuple[CallInSource, ...]:
     """How a function calls the rasterizer, once for each place that does.
 
     Empty if the function is absent or makes no settings.
     """
     body = repo.function(module, function)
     if body is None:
-        return []
+        return ()
     imported = _Imported(repo, module, body)
     made = [node for node in every(body, ast.Call) if imported.of(node, SETTINGS)]
     settings = _settings(made[0]) if made else {}
     if not settings:
-        return []
+        return ()
 
     def call(
         maker: ast.Call, place: ast.expr | Function, given: dict[str, ast.expr] | None = None
@@ -150,7 +153,7 @@ def read_calls(repo: HostRepo, module: str, function: str) -> list[CallInSource]
             keywords = [each for each in maker.keywords if each.arg != "raster_settings"]
             given = {each.arg: each.value for each in [*keywords, *node.keywords] if each.arg}
             found.append(call(maker, targets.get(node, node), given))
-    return sorted(found, key=lambda each: each.line) or [call(made[0], body)]
+    return tuple(sorted(found, key=lambda each: each.line)) or (call(made[0], body),)
 
 
 def _settings(made: ast.Call) -> dict[str, ast.expr]:
@@ -197,12 +200,13 @@ class _Imported:
         self.classes: dict[str, tuple[str, str]] = {}
         self.modules: dict[str, str] = {}
         for scope in (repo.tree(module), body):
-            for node in nodes(scope):
+            statements: tuple[Any, ...] = every(scope, ast.Import, ast.ImportFrom)
+            for node in statements:
                 if isinstance(node, ast.ImportFrom):
                     package = repo.absolute(module, node)
                     for each in node.names:
                         self.classes[each.asname or each.name] = package, each.name
-                elif isinstance(node, ast.Import):
+                else:
                     self.modules |= {each.asname or each.name: each.name for each in node.names}
 
     def of(self, node: ast.AST | None, name: str) -> bool:

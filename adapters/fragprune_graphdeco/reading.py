@@ -170,7 +170,8 @@ def made_models(repo: HostRepo, module: str) -> list[str]:
 _ELSEWHERE = re.compile(r"\w+(?:\.\w+)*\.(?:scene(?:\.\w+)*|gaussian_renderer)")
 
 
-def failing(repo: HostRepo, scripts: Collection[str]) -> list[str]:
+@lru_cache(maxsize=64)  # of the adapters, many ask
+def failing(repo: HostRepo, scripts: tuple[str, ...]) -> tuple[str, ...]:
     """Why scripts fail or pass all seams by: modules that are imported under other names, which are
     others to Python; another framework; compiled training; calls that their functions do not take;
     a PLY that gets its name after it was saved.
@@ -193,7 +194,7 @@ def failing(repo: HostRepo, scripts: Collection[str]) -> list[str]:
         found += [*_broken(repo, module)][:1]
         found += (*_misfits(repo, module), *_absent(repo, module), *_own_folders(repo, module))[:1]
         found += [f"{script} draws by {each}" for each in _drawn_elsewhere(repo, module)][:1]
-    return found
+    return tuple(found)
 
 
 def _imported_elsewhere(repo: HostRepo) -> Iterator[str]:
@@ -466,7 +467,7 @@ Known = Callable[[ast.AST], list[Any]]
 def skipped(tree: ast.AST | None, known: Known) -> dict[ast.AST, ast.expr]:
     """What code does not do by the values that are known: nodes, with the test before each."""
     found: dict[ast.AST, ast.expr] = {}
-    branching: list[Any] = [n for n in nodes(tree) if isinstance(n, ast.If | ast.IfExp)]
+    branching: tuple[Any, ...] = every(tree, ast.If, ast.IfExp)
     for node in branching:
         taken = decided(node.test, known)
         branch = None if taken is None else node.orelse if taken else node.body
@@ -637,9 +638,9 @@ def reached(repo: HostRepo, modules: Iterable[str], without: str = "") -> dict[s
         if module in seen or tree is None or module.split(".")[0] == without:
             continue
         seen[module] = tree
-        for node in nodes(tree):
-            if isinstance(node, ast.Import | ast.ImportFrom):
-                waiting += _own_imports(repo, module, node)
+        statements: tuple[Any, ...] = every(tree, ast.Import, ast.ImportFrom)
+        for node in statements:
+            waiting += _own_imports(repo, module, node)
     return seen
 
 

@@ -8,13 +8,12 @@ thresholds.
 
 from __future__ import annotations
 
-import ast
 import re
 from argparse import ArgumentParser
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fragprune_graphdeco import MODEL, GraphdecoAdapter, RasterizerCall
+from fragprune_graphdeco import MODEL, GraphdecoAdapter, RasterizerCall, text_of
 from fragprune_plugins.adapting import (
     Finding,
     HostInfo,
@@ -105,7 +104,7 @@ class RT4DGS(GraphdecoAdapter):
 
         What it drew before is another picture of the same numbers.
         """
-        texts = [ast.unparse(repo.tree(each) or ast.Pass()) for each in (MODEL, ROTATIONS)]
+        texts = [text_of(repo.tree(each)) for each in (MODEL, ROTATIONS)]
         found = super().fingerprint(repo)
         if not any(map(re.compile(r"\bflip\([^()]*1, 2").search, texts)):
             older, at = (

@@ -131,7 +131,7 @@ class HostRepo:
         if module not in self._paths:
             base = self.root.joinpath(*module.split("."))
             both = (base / "__init__.py", base.with_suffix(".py"))
-            found = (each for each in both if self._inside(each) and os.path.isfile(each))
+            found = (each for each in both if os.path.isfile(each) and self._inside(each))
             self._paths[module] = next(found, None)  # also for too long a name
         return self._paths[module]
 
