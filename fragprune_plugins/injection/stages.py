@@ -189,15 +189,18 @@ class Stages:
         """Run the host's script with learning on; the result is its model of iteration ``last``."""
         started = time.time() - 0.1  # a file has the time of the last tick of the clock
 
+        def kept() -> Path | None:
+            return self._model(last, started)
+
         def ended(session: Session) -> None:
-            unsaved = session.held is not None and not self._model(last, started)
+            unsaved = session.held is not None and not kept()
             if unsaved and (path := session.save_learned(last)):
                 log.warning("the host saved no model of its last iteration: saved %s", path)
 
         try:
-            self._execute(arguments, learn=True, ended=ended, **options)
+            self._execute(arguments, learn=True, ended=ended, kept=kept, **options)
         except HostFailed as error:
-            if (path := self._model(last, started)) is None:
+            if (path := kept()) is None:
                 raise
             remedy = f"{error.remedy} The learned model was saved: {path}"
             raise HostFailed(error.where, error.found, error.expected, remedy) from error
@@ -231,9 +234,14 @@ class Stages:
         learn: bool,
         settings: Settings | None = None,
         ended: Callable[[Session], None] = lambda _: None,
+        kept: Callable[[], Path | None] = lambda: None,
         **options: Any,
     ) -> None:
-        """Run the host's script in a session with these options; ``ended`` gets it at its end."""
+        """Run the host's script in a session with these options; ``ended`` gets it at its end.
+
+        Ctrl-C after the last model was saved, which ``kept`` gives, ends a host that waits with its
+        viewer open.
+        """
         session = Session(
             self.adapter,
             self.repo,
@@ -262,8 +270,9 @@ class Stages:
                     process.run_main(host.script, host.module)
                     ended(session)
                 except KeyboardInterrupt as error:  # the session still writes sidecars
-                    saved = session.save_learned() if learn else None
-                    raise self._interrupted(error, saved) from error
+                    if isinstance(error, Terminate) or not kept():
+                        saved = session.save_learned() if learn else None
+                        raise self._interrupted(error, saved) from error
             session.expect_drawn()
         finally:
             self.output = session.output or self.output

@@ -70,6 +70,14 @@ def test_stage_two_follows_the_training_in_one_longer_run(release, train, tmp_pa
     assert {evaluated(out, at)["num_GS"] for at in (TOTAL, TOTAL + MORE)} == {summary.gaussians}
 
 
+def test_ctrl_c_closes_the_viewer_of_a_training_that_is_over(train, tmp_path):
+    """It is open by default, and the script says: Ctrl+C to exit."""
+    summary = train("--viewer", "open")
+    assert summary.steps == MORE
+    assert summary.model_after == checkpoint(tmp_path / "out", TOTAL + MORE)
+    assert sidecar.load(summary.model_after)[0].steps == MORE - 1  # the script's own, as it was
+
+
 def test_an_evaluation_draws_with_the_thresholds_beside_its_checkpoint(release, train, tmp_path):
     out, last = tmp_path / "out", checkpoint(tmp_path / "out", TOTAL + MORE)
     train("--eval_steps", 3)

@@ -25,6 +25,7 @@ class Config:
     max_steps: int = 30_000
     eval_steps: str = "7000 30000"
     save_steps: str = "7000 30000"
+    viewer: str = ""
     strategy: str = "default"
 
 
@@ -120,7 +121,10 @@ class Runner:
 def main(local_rank, world_rank, world_size, config):
     runner = Runner(config)
     if config.ckpt is None:
-        return runner.train()
+        runner.train()
+        if config.viewer:
+            raise KeyboardInterrupt  # the viewer is open until then
+        return None
     saved = torch.load(config.ckpt, map_location="cuda:0", weights_only=True)
     for name in runner.splats:
         runner.splats[name].data = saved["splats"][name]
