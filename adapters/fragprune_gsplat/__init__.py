@@ -7,8 +7,9 @@ and draws; strategies change rows through a handful of functions that treat ever
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Hashable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -45,6 +46,8 @@ LPIPS = Seam(
 """With what gsplat's trainer and nerfstudio measure."""
 ROWS = "fragprune_rows"
 """Key under which row numbers ride along while a strategy changes rows."""
+DRIFT = 1e-3
+"""How far the numbers of a pose that learns move from one visit to the next, at most."""
 GROUPS = {
     "means": "xyz",
     "sh0": "f_dc",
@@ -233,6 +236,29 @@ class Gsplat(HostAdapter):
         opacities: Tensor = model["opacities"]
         return opacities.detach().sigmoid().reshape(-1)
 
-    def view(self, camera: Any) -> int:
-        """A key from the camera's numbers, because loaders make a new tensor for every step."""
-        return hash(camera.detach().cpu().numpy().tobytes())
+    def view(self, camera: Tensor) -> Hashable:
+        """A key from each camera's numbers, because loaders make a new tensor for every step."""
+        poses = camera.detach().cpu()
+        if camera.requires_grad:
+            keys = tuple(map(self._learned_pose, poses))
+        else:
+            keys = tuple(hash(each.numpy().tobytes()) for each in poses)
+        if len(keys) > 1:  # several pictures of one camera are pictures of the whole call
+            return keys if len(set(keys)) == len(keys) else hash(keys)
+        return keys[0]
+
+    @cached_property
+    def _poses(self) -> list[Tensor]:
+        """Poses that learn, each as it was last drawn."""
+        return []
+
+    def _learned_pose(self, pose: Tensor) -> int:
+        """The number of a pose that moves a little from visit to visit."""
+        import torch
+
+        number = len(self._poses)
+        if number:
+            away = (pose - torch.stack(self._poses)).abs().amax(dim=(1, 2))
+            number = int(away.argmin()) if away.min() < DRIFT else number
+        self._poses[number : number + 1] = [pose]
+        return number

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -321,8 +321,8 @@ class HostAdapter(ABC):
     def opacities(self, model: Any) -> Tensor:
         """(N,) activated opacities."""
 
-    def view(self, camera: Any) -> int:
-        """A key that identifies a training view; by default the object's id."""
+    def view(self, camera: Any) -> Hashable:
+        """A key that identifies a training view, or a tuple of several; by default the id."""
         return id(camera)
 
     def model_of(self, call: SeamCall) -> Any:

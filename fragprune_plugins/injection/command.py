@@ -124,10 +124,8 @@ def _without_options(words: list[str], *, quietly: bool) -> list[str]:
         if rest.pop(0) in ("-W", "-X"):
             rest = rest[1:]
     if not quietly and (given := words[: len(words) - len(rest)]):
-        log.warning(
-            "python %s: has no effect, because the script runs in the interpreter of fragprune",
-            " ".join(given),
-        )
+        why = "the script runs in the interpreter of fragprune"
+        log.warning("python %s: has no effect, because %s", " ".join(given), why)
     return rest
 
 

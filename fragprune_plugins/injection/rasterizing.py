@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -56,42 +56,48 @@ def on_view(session: SessionState, call: SeamCall) -> Any:
         expect_unpacked_attached(session, call)
         if session.learn and torch.is_grad_enabled() and not session.warned:
             session.warned = True
-            log.warning(
-                "%s draws Gaussians that no seam attached; they have no thresholds", call.seam
-            )
+            log.warning("%s draws Gaussians that no seam attached, without thresholds", call.seam)
         return call.run()
     if session.unpacked is not None:
         attach_file(session, model, *session.unpacked)
     state, view = session.models.get(model), session.adapter.view(call.first)
-    begins = session.adapter.steps_by_rendering and session.learn and torch.is_grad_enabled()
+    learned = torch.is_grad_enabled()
+    begins = session.adapter.steps_by_rendering and session.learn and learned
     if begins and state is not None and not state.begun:
         if call.how(True):
             begin_step(session, model, state)
         else:
             expect_to_train(session, call, model)
-
-    def again() -> Any:
-        """Call the host's function; inside, ``session.rendering`` holds its model and view."""
-        token = session.rendering.set((model, view))
-        try:
-            with asking_for_no_gradient(frozen_parameters(session, model)) as cut:
-                given = {name: cut(each) for name, each in call.kwargs.items()}
-                return call.function(*map(cut, call.args), **given)
-        finally:
-            session.rendering.reset(token)
-
-    measured = isinstance(session.settings.goal, Fewer)  # a kept view keeps its model alive
     if state is not None and state.stage is not None:
-        learned = torch.is_grad_enabled()
         state.beside = learned and bool(state.ordered) and state.stepped == state.steps
         if learned and not state.beside:
             state.drawn = state.steps
             if state.stage.plan is not None:
-                state.seen[view] = None
-                if measured:
-                    state.views[view] = again
+                views = view if isinstance(view, tuple) else (view,)
+                state.seen |= dict.fromkeys(views)
+                if isinstance(session.settings.goal, Fewer):  # a kept view keeps its model alive
+                    state.views |= dict.fromkeys(views, again(session, model, state, view, call))
         state.stage.picture = str(getattr(call.first, "image_name", ""))
-    return again()
+    return draw_view(session, model, view, call, {})
+
+
+def draw_view(session: SessionState, model: Any, view: Any, call: SeamCall, own: Any) -> Any:
+    """Call the host's function; inside, ``session.rendering`` holds its model and view."""
+    token = session.rendering.set((model, view))
+    try:
+        with asking_for_no_gradient(frozen_parameters(session, model)) as cut:
+            return call.run(**{name: cut(it) for name, it in (call.arguments | own).items()})
+    finally:
+        session.rendering.reset(token)
+
+
+def again(*drawn: Any) -> Callable[[], Any]:
+    """Draws a view again; tensors of all Gaussians are the newest call's, so that none are kept."""
+    session, model, state, view, call = drawn
+    state.newest, rows = call, len(state.store)
+    shapes = {name: getattr(each, "shape", ()) for name, each in call.arguments.items()}
+    own = {name: call.arguments[name] for name, each in shapes.items() if each[:1] != (rows,)}
+    return lambda: draw_view(session, model, view, state.newest, own)
 
 
 def expect_to_train(session: SessionState, call: SeamCall, model: Any) -> None:
@@ -154,9 +160,9 @@ def on_rasterize(session: SessionState, call: SeamCall) -> Any:
             view = rendering[1]
 
             def truncated(each: RasterInputs, part: int = 0) -> RasterOutputs:
-                if further_picture(state, view, part):
-                    return engine.rasterize(each, covering(thresholds, each))
-                return rasterize(engine, state, view, thresholds, each, part)
+                each = replace(each, **state.store.rules)  # another camera of the call has none
+                picture = (view[part], 0) if isinstance(view, tuple) else (view, part)
+                return rasterize(engine, state, picture, thresholds, each)
 
             return answer(drawn, inputs, truncated)
     return by_host()
@@ -170,7 +176,7 @@ def covering(thresholds: Tensor | None, inputs: RasterInputs) -> Tensor | None:
     return torch.cat([thresholds, added])
 
 
-def further_picture(state: ModelState, view: int, part: int) -> bool:
+def further_picture(state: ModelState, picture: tuple[Hashable, int]) -> bool:
     """Whether this was drawn before in this step: a host may also draw depth or normals of a view.
 
     The first picture bears the pressure, and its fragments count.
@@ -178,9 +184,8 @@ def further_picture(state: ModelState, view: int, part: int) -> bool:
     if not torch.is_grad_enabled():
         return False
     drawn = {each for each in state.pictured if each[0] == state.steps}
-    picture = state.steps, view, part
-    state.pictured = drawn | {picture}
-    return picture in drawn
+    state.pictured = drawn | {(state.steps, *picture)}
+    return len(state.pictured) == len(drawn)
 
 
 def proved_answer(
@@ -233,14 +238,13 @@ def unpack(session: SessionState, call: HostCall) -> tuple[RasterInputs, Engine]
 def rasterize(
     engine: Engine,
     state: ModelState,
-    view: int,
+    picture: tuple[Hashable, int],
     thresholds: Tensor | None,
     inputs: RasterInputs,
-    part: int = 0,
 ) -> RasterOutputs:
     """Draw with thresholds (N,) or without; while learning, add the pressure to the loss."""
-    if state.stage is None or state.beside:
-        return engine.rasterize(inputs, thresholds)
+    if further_picture(state, picture) or state.stage is None or state.beside:
+        return engine.rasterize(inputs, covering(thresholds, inputs))
     shown = state.stage.dropped(inputs)
     outputs = engine.rasterize(shown, thresholds)
 
@@ -250,7 +254,7 @@ def rasterize(
         return engine.rasterize(replace(inputs, stop=None), None)
 
     area = area_per_pixel(inputs) if state.stage.settings.goal.on_area else None
-    pressure = state.stage.on_drawn(view, outputs, untruncated, part, area)
+    pressure = state.stage.on_drawn(picture[0], outputs, untruncated, picture[1], area)
     if pressure is None or not outputs.image.requires_grad:
         return outputs
     return replace(outputs, image=_AddToLoss.apply(outputs.image, pressure))  # type: ignore[no-untyped-call]

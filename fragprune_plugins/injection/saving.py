@@ -80,8 +80,7 @@ def on_pack(session: SessionState, call: SeamCall) -> Any:
 def on_unpack(session: SessionState, call: SeamCall) -> Any:
     """Keep the thresholds of an unpacked file until its model exists."""
     result = call.run()
-    packed = call.how()
-    if packed is not None and sidecar.find(packed[0]):
+    if (packed := call.how()) is not None and sidecar.find(packed[0]):
         file, means = packed
         session.unpacked = means, sidecar.load(file, len(means))[0]
     return result

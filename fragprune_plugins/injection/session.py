@@ -124,6 +124,7 @@ class Session(SessionState):
                 state.hooks.pop().remove()
             state.hooked.clear()
             state.views.clear()  # their calls hold the host's model, cameras and photographs
+            state.newest = None
         findings = self._ledger.undo() if self._ledger else []
         self._ledger = None
         self.stand_ins.take_back()

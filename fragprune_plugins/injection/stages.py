@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -119,9 +120,8 @@ class Stages:
         except HostFailed as error:
             if (saved := end()) is None:
                 raise
-            log.warning(
-                "the host had saved %s when it failed, and stage 2 goes on: %s", saved, str(error)
-            )
+            said = "the host had saved %s when it failed, and stage 2 goes on: %s"
+            log.warning(said, saved, str(error))
         gc.collect()  # the error held the host's frames, and so its socket and its model
         if (saved := end()) is None:  # some hosts refuse a command with exit code 0
             found = f"ended without a checkpoint of iteration {total}"
@@ -189,8 +189,7 @@ class Stages:
         """Run the host's script with learning on; the result is its model of iteration ``last``."""
         started = time.time() - 0.1  # a file has the time of the last tick of the clock
 
-        def kept() -> Path | None:
-            return self._model(last, started)
+        kept = partial(self._model, last, started)
 
         def ended(session: Session) -> None:
             unsaved = session.held is not None and not kept()
@@ -237,11 +236,7 @@ class Stages:
         kept: Callable[[], Path | None] = lambda: None,
         **options: Any,
     ) -> None:
-        """Run the host's script in a session with these options; ``ended`` gets it at its end.
-
-        Ctrl-C after the last model was saved, which ``kept`` gives, ends a host that waits with its
-        viewer open.
-        """
+        """Run the host's script in a session with these options; ``ended`` gets it at its end."""
         session = Session(
             self.adapter,
             self.repo,
@@ -270,7 +265,7 @@ class Stages:
                     process.run_main(host.script, host.module)
                     ended(session)
                 except KeyboardInterrupt as error:  # the session still writes sidecars
-                    if isinstance(error, Terminate) or not kept():
+                    if isinstance(error, Terminate) or not kept():  # else it closes a viewer
                         saved = session.save_learned() if learn else None
                         raise self._interrupted(error, saved) from error
             session.expect_drawn()

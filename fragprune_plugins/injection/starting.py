@@ -86,8 +86,7 @@ def find(adapter: ScriptAdapter, host: HostCommand, output: Path | None) -> Star
         log.warning(
             "%s is of a later iteration, but it is older than the file from which stage 2 starts; "
             "to start from it, name it with %s",
-            max(reversed(later), key=lambda each: each[0])[1],
-            flag,
+            *(max(reversed(later), key=lambda each: each[0])[1], flag),
         )
     passed = f"; newer files of stage 2 ignored: {newer}" if newer else ""
     return Start(iteration, path, f"the last file that the host's own training wrote{passed}")

@@ -8,7 +8,7 @@ store.
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -47,6 +47,7 @@ class ModelState:
         pending_parents: (P,) int64 rows of the parents that the host is about to copy.
         prepared: the adapter has prepared the model for stage 2.
         views: by view, a function that draws the view again, from its last visit.
+        newest: the call whose Gaussians these functions draw.
         seen: views that were drawn to learn from, in the order of their first visits.
         loaded: the means with which a sidecar's thresholds were loaded.
         stepped: value of ``steps`` at the last step of the store.
@@ -63,13 +64,14 @@ class ModelState:
     begun: bool = False
     pending_parents: Tensor | None = None
     prepared: bool = False
-    views: dict[int, Callable[[], Any]] = field(default_factory=dict)
-    seen: dict[int, None] = field(default_factory=dict)
+    views: dict[Hashable, Callable[[], Any]] = field(default_factory=dict)
+    newest: Any = None
+    seen: dict[Hashable, None] = field(default_factory=dict)
     loaded: weakref.ReferenceType[Any] | None = None
     hooked: weakref.WeakSet[Any] = field(default_factory=weakref.WeakSet)
     hooks: list[Any] = field(default_factory=list)
     stepped: int = -1
-    pictured: set[tuple[int, int, int]] = field(default_factory=set)
+    pictured: set[tuple[int, Hashable, int]] = field(default_factory=set)
     lent: list[list[tuple[dict[str, Any], Any]]] = field(default_factory=list)
     drawn: int = -1
     ordered: bool | None = None
@@ -150,7 +152,7 @@ class SessionState:
         self.last: weakref.ReferenceType[Any] | None = None
         self.held: Any = None  # the model after its last step, until the host saved it
         self.last_state: ModelState | None = None  # stays when the host drops its model
-        self.rendering: ContextVar[tuple[Any, int] | None] = ContextVar("rendering", default=None)
+        self.rendering: ContextVar[tuple[Any, Any] | None] = ContextVar("rendering", default=None)
         self.pausing: ContextVar[bool] = ContextVar("paused", default=False)
 
     def engine(self, device: torch.device) -> Engine:
@@ -162,11 +164,8 @@ class SessionState:
         if device not in self.engines:
             engine = engine_for(self.engine_name, device, self.plugins)
             if engine.name == "reference":
-                log.warning(
-                    "the reference engine draws on %s: it is exact, and slow; "
-                    "fragprune doctor says why no faster engine is used",
-                    device,
-                )
+                why = "it is exact, and slow; fragprune doctor says why no faster engine is used"
+                log.warning("the reference engine draws on %s: %s", device, why)
             self.engines[device] = engine
         return self.engines[device]
 
@@ -235,9 +234,7 @@ class SessionState:
             log.warning(
                 "%s: saved in step %d of %d, before thresholds open: nothing is truncated yet. "
                 "If training ends here, give its length as Settings.iterations.",
-                path,
-                state.stage.steps,
-                self.settings.iterations,
+                *(path, state.stage.steps, self.settings.iterations),
             )
         self.write_sidecar(path, state.store if learned else None, whole)
 
@@ -268,10 +265,9 @@ class SessionState:
         """
         means = self.adapter.means(model)
         store = sidecar.thresholds_of(path, len(means), means.device)
-        if store is None:
-            return False
-        self._give(model, store, str(path))
-        return True
+        if store is not None:
+            self._give(model, store, str(path))
+        return store is not None
 
     def take_up(self, model: Any, saved: dict[str, Any]) -> None:
         """Give a model the thresholds that ``ThresholdStore.state_dict`` gave for its Gaussians.

@@ -7,6 +7,7 @@ import json
 import math
 import runpy
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -325,9 +326,10 @@ def test_a_target_is_met_over_every_camera_of_a_call(session_on, count):
         rasterize = engine.rasterize
 
         def counting(inputs, thresholds):
-            pair = [rasterize(inputs, each).fragments_per_pixel for each in (None, thresholds)]
-            counts.append(torch.stack(pair).detach())
-            return rasterize(inputs, thresholds)
+            drawn = rasterize(inputs, thresholds)
+            pair = rasterize(replace(inputs, stop=None), None), drawn
+            counts.append(torch.stack([each.fragments_per_pixel for each in pair]).detach())
+            return drawn
 
         engine.rasterize = counting
         with torch.no_grad():
@@ -338,6 +340,53 @@ def test_a_target_is_met_over_every_camera_of_a_call(session_on, count):
     assert before / after == pytest.approx(1.5, rel=0.03)  # 0.01, and opacities moved since
     assert summary.target_reached
     assert summary.fragments_before / summary.fragments_after == pytest.approx(1.5, rel=0.01)
+
+
+def test_every_camera_of_a_call_is_drawn_with_the_models_stop_and_rim(session_on):
+    settings = Settings(iterations=4, stop=0.3, rim="soft")
+    with session_on(Gsplat(), settings=settings) as session:
+        params, _ = attached()
+        engine, drawn = session.engine(torch.device("cpu")), []
+        rasterize = engine.rasterize
+
+        def recording(inputs, thresholds):
+            drawn.append((inputs.stop, inputs.rim))
+            return rasterize(inputs, thresholds)
+
+        engine.rasterize = recording
+        for _ in range(2):
+            drawn.clear()
+            draw(params, 3)[0].mean().backward()
+    assert drawn == [(0.3, "soft")] * 3
+
+
+@pytest.mark.parametrize("learns", [False, True])
+def test_a_view_is_the_same_in_any_batch_and_while_its_pose_learns(session_on, learns):
+    """What a target draws again are the Gaussians of now: none are kept for each view."""
+    with session_on(Gsplat(), settings=Settings(iterations=9, goal=Fewer(1.5))) as session:
+        params, optimizers = attached()
+        poses, _ = cameras(4)
+        for step, pair in enumerate([[0, 1], [2, 3], [3, 1], [0, 2], [1, 2], [3, 0]]):
+            viewmats = poses[pair] + (1e-4 * step if learns else 0)
+            known = params["opacities"].detach().sigmoid()
+            draw(params, 2, viewmats=viewmats.requires_grad_(learns))[0].mean().backward()
+            optimizers["opacities"].step()
+            for parameter in params.values():
+                parameter.grad = None
+        state, engine, drawn = session.last_state, session.engine(torch.device("cpu")), []
+        rasterize = engine.rasterize
+
+        def recording(inputs, thresholds):
+            drawn.append(inputs.splats.opacities)
+            return rasterize(inputs, thresholds)
+
+        engine.rasterize = recording
+        with torch.no_grad():
+            for again in state.views.values():
+                again()
+    assert len(state.seen) == 4
+    assert len(drawn) == 8
+    assert all(torch.equal(each, known) for each in drawn)
 
 
 def test_a_target_is_met_without_views_drawn_before_rows_changed(session_on):
