@@ -138,7 +138,7 @@ class Gsplat(HostAdapter):
         states="1.4, 1.5, 1.6 (pinhole cameras)",
         limits=(
             "Refused by name: other cameras, distortion, the unscented transform, distributed, "
-            "batches, channels other than three, tiles other than 16 pixels.",
+            "batches, channels other than three, tiles other than 16 pixels, rasterization_2dgs.",
             "absgrad is refused before stage 2 on a CPU, and where thresholds learn inside the "
             "training; several GPUs in one training are refused.",
             "Its own examples/simple_trainer.py cannot resume: both stages are one run.",
@@ -175,6 +175,7 @@ class Gsplat(HostAdapter):
             by="covariance",
         ),
         answered("distributed", "cli", "fn", "args", by="alone"),
+        answered("rendering", "rasterization_2dgs", by="surfels"),
         Seam(Role.SAVE, "torch", "save", ("f", "obj"), external=True),
         Seam(Role.UNPACK, "torch", "load", ("f",), external=True, how=read_again),
         Seam(Role.SAVE, EXPORTER, "export_splats", ("save_to", "means", "format")),

@@ -11,6 +11,7 @@ Importing this module imports no nerfstudio; only nerfstudio's own entry point d
 from __future__ import annotations
 
 import hashlib
+import logging
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -32,6 +33,7 @@ from fragprune_plugins.adapting import (
 if TYPE_CHECKING:
     from torch import Tensor
 
+log = logging.getLogger("fragprune")
 PACKAGE = "nerfstudio"
 METHOD = "fragprune-splatfacto"
 SPLATFACTO = f"{PACKAGE}.models.splatfacto"
@@ -70,10 +72,14 @@ def exported(call: SeamCall) -> tuple[Path, Tensor]:
     if model is None:
         return path, torch.arange(0)
     try:
-        return path, rows_exported(model.gauss_params, columns)
+        rows = rows_exported(model.gauss_params, columns)
     except AlignmentError:
         path.unlink(missing_ok=True)
         raise
+    if (mode := model.config.rasterize_mode) != "classic":
+        said = "%s: trained %s; fragprune's commands draw it as 3DGS does, as other viewers do"
+        log.warning(said, path, mode)
+    return path, rows
 
 
 class Nerfstudio(HostAdapter):

@@ -14,10 +14,14 @@ ITERATIONS = 30_000
 """nerfstudio's default for splatfacto."""
 LENGTH, MODEL = "--max-num-iterations", "--pipeline.model"
 LOADS = ("--load-dir", "--load-checkpoint")
-ELSEWHERE = {
-    "splatfacto-big": f"splatfacto {MODEL}.cull-alpha-thresh 0.005 "
-    f"{MODEL}.densify-grad-thresh 0.0005"
+VARIANTS = {
+    "splatfacto-big": {
+        f"{MODEL}.cull-alpha-thresh": "0.005",
+        f"{MODEL}.densify-grad-thresh": "0.0005",
+        "--optimizers.bilateral-grid.optimizer.lr": "0.005",
+    }
 }
+"""Methods that are splatfacto with other defaults, as nerfstudio 1.1.5 has them."""
 
 
 def rewritten(
@@ -43,10 +47,9 @@ def rewritten(
         UsageError: the arguments ask for another method, or for what ns-train cannot do; or for
             another GPU than the first.
     """
-    if not arguments or arguments[0] not in (HOST, method):
+    if not arguments or arguments[0] not in (HOST, method, *VARIANTS):
         found = arguments[0] if arguments else "no method"
-        instead = ELSEWHERE.get(found, HOST)
-        raise UsageError("ns-train", found, HOST, f"Train with: ns-train {instead} ...")
+        raise UsageError("ns-train", found, HOST, f"Train with: ns-train {HOST} ...")
     kind, _, number = device.partition(":")
     if int(number or 0):
         found, remedy = "ns-train, which names the first GPU", f"Set CUDA_VISIBLE_DEVICES={number}."
@@ -68,7 +71,7 @@ def rewritten(
             "Drop --stage; ns-eval, ns-export and the viewer need no fragprune run.",
         )
     total = ITERATIONS if given is None else given
-    ours: dict[str, Any] = {}
+    ours: dict[str, Any] = dict(VARIANTS.get(arguments[0], {}))
     if from_iter is not None:
         if from_iter >= total:
             raise UsageError(

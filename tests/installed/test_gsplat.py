@@ -260,6 +260,15 @@ def test_what_we_do_not_draw_is_refused_by_name(session_on, options):
             draw(params, **options)
 
 
+def test_surfels_are_refused_where_nothing_of_them_would_learn(session_on):
+    """They are drawn by a function of their own, so no step would be counted."""
+    with session_on(Gsplat()):
+        from gsplat import rasterization_2dgs
+
+        with pytest.raises(InputError, match="surfels"):
+            rasterization_2dgs()
+
+
 def test_absolute_gradients_are_refused_until_nothing_reads_them(session_on):
     """A strategy reads them where it adds Gaussians, which it does no more in stage 2."""
     with session_on(Gsplat(), settings=Settings(iterations=4), from_step=1):

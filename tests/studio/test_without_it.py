@@ -83,12 +83,20 @@ def test_a_run_of_splatfacto_is_one_of_ours_that_is_longer_by_stage_two(words, o
     assert sum("max" in word for word in got) == 1
 
 
+def test_the_larger_splatfacto_is_one_with_other_defaults():
+    """The user's own flags come behind them."""
+    given = "--pipeline.model.cull-alpha-thresh"
+    got = rewrite("splatfacto-big", given, "0.01")
+    assert [got[at + 1] for at, word in enumerate(got) if word == given] == ["0.005", "0.01"]
+    assert got[got.index("--pipeline.model.densify-grad-thresh") + 1] == "0.0005"
+    assert got[0] == METHOD
+
+
 @pytest.mark.parametrize(
     ("words", "options", "remedy"),
     [
         ([], {}, "splatfacto"),
         (["nerfacto"], {}, "splatfacto"),
-        (["splatfacto-big"], {}, "cull-alpha-thresh"),
         (["splatfacto", "--load-config", "x"], {}, "--load-dir"),
         (["splatfacto"], {"stage": "joint"}, "--stage"),
         (["splatfacto"], {"stage": "off"}, "ns-eval"),
@@ -197,6 +205,19 @@ def test_a_file_of_other_gaussians_is_removed_before_anybody_takes_it(tmp_path, 
     with pytest.raises(AlignmentError):
         exported(call)
     assert not file.exists()
+
+
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+def test_an_export_says_that_its_picture_loses_the_antialiasing(
+    tmp_path, monkeypatch, caplog, mode
+):
+    config = SimpleNamespace(rasterize_mode=mode)
+    own = SimpleNamespace(gauss_params=model(3), config=config)
+    monkeypatch.setattr(session, "_active", SimpleNamespace(last=lambda: own))
+    columns = exporters(own.gauss_params, torch.arange(3))
+    given = {"filename": str(tmp_path / "splat.ply"), "map_to_tensors": columns}
+    assert len(exported(SimpleNamespace(arguments=given))[1]) == 3
+    assert ("trained antialiased" in caplog.text) == (mode == "antialiased")
 
 
 def test_the_crop_of_a_view_has_the_models_rows_by_position_and_rotation():
