@@ -219,8 +219,7 @@ class Stages:
             photographs, drawing = self.adapter.photographs(*host), self.adapter.drawing(*host)
             if starting.holds(checkpoint, before):
                 return look(before, photographs, drawing, settings)
-            why = f"{checkpoint} has other Gaussians than {before}, as where a host densifies in "
-            why += "its last iteration"
+            why = f"{checkpoint} has other Gaussians than {before}, which its last iteration made"
         except NotComparedError as error:
             why = f"{error.where}: {error.found}"
         log.warning("stage 2 learns as asked, without a look at the model: %s", why)
