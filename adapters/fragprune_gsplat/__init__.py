@@ -18,6 +18,7 @@ from fragprune_plugins.adapting import (
     HostAdapter,
     HostInfo,
     HostRepo,
+    InputError,
     ParamGroup,
     Role,
     RowTrace,
@@ -103,6 +104,17 @@ def answered(module: str, name: str, *needs: str, by: str) -> Seam:
     return Seam(Role.ANSWER, f"{PACKAGE}.{module}", name, needs, how=how)
 
 
+def surfels(call: SeamCall) -> None:
+    """Refuse a step of a training that draws surfels, which would count and learn nothing.
+
+    Raises:
+        InputError: always.
+    """
+    found, remedy = "surfels, which have no cutoffs here", "Train without fragprune, or train 2DGS "
+    remedy += "in its own repository, which fragprune knows."
+    raise InputError(str(call.seam), found, "gsplat.rasterization", remedy)
+
+
 def splats_in(saved: Any) -> Tensor | None:
     """(N, 3) the means in what ``torch.save`` and ``torch.load`` are given; None without any.
 
@@ -150,6 +162,7 @@ class Gsplat(HostAdapter):
     seams: tuple[Seam, ...] = (
         Seam(Role.RASTERIZE, RENDERING, "rasterization", DRAWN),
         Seam(Role.VIEW, RENDERING, "rasterization", ("viewmats",)),
+        Seam(Role.VIEW, RENDERING, "rasterization_2dgs", ("viewmats",), how=surfels),
         Seam(Role.LOSS, "torch", "Tensor.backward", external=True),
         Seam(Role.ATTACH, BASE, "Strategy.check_sanity", ("params", "optimizers"), how=optimizers),
         _operation("duplicate", "mask"),
@@ -175,7 +188,6 @@ class Gsplat(HostAdapter):
             by="covariance",
         ),
         answered("distributed", "cli", "fn", "args", by="alone"),
-        answered("rendering", "rasterization_2dgs", by="surfels"),
         Seam(Role.SAVE, "torch", "save", ("f", "obj"), external=True),
         Seam(Role.UNPACK, "torch", "load", ("f",), external=True, how=read_again),
         Seam(Role.SAVE, EXPORTER, "export_splats", ("save_to", "means", "format")),

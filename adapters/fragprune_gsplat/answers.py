@@ -10,7 +10,6 @@ from torch import Tensor
 from fragprune_graphdeco import stand_ins
 from fragprune_gsplat.projection import covariances
 from fragprune_plugins.adapting import EngineError, InputError, SeamCall
-from fragprune_plugins.injection.session import active_session
 
 EPSILON = torch.finfo(torch.float32).eps
 
@@ -61,17 +60,3 @@ def alone(call: SeamCall) -> Any:
         where, found = "gsplat.distributed.cli", f"{count} GPUs, and a process for each"
         raise EngineError(where, found, "one GPU", "Choose it: set CUDA_VISIBLE_DEVICES=0.")
     return call.run() if count else given["fn"](0, 0, 1, given["args"])
-
-
-def surfels(call: SeamCall) -> Any:
-    """Draw surfels where nothing is to learn.
-
-    Raises:
-        InputError: no step would be counted, and nothing learned.
-    """
-    session = active_session()
-    if session is not None and session.learn:
-        found, expected = "surfels, which have no cutoffs here", "gsplat.rasterization"
-        remedy = "Train without fragprune, or train 2DGS in its own repository: fragprune knows it."
-        raise InputError("gsplat.rasterization_2dgs", found, expected, remedy)
-    return call.run()

@@ -265,8 +265,10 @@ def test_surfels_are_refused_where_nothing_of_them_would_learn(session_on):
     with session_on(Gsplat()):
         from gsplat import rasterization_2dgs
 
+        params, _ = attached()
+        given = (params["means"], params["quats"], params["scales"].exp(), params["opacities"])
         with pytest.raises(InputError, match="surfels"):
-            rasterization_2dgs()
+            rasterization_2dgs(*given, params["sh0"], *cameras(), WIDTH, HEIGHT)
 
 
 def test_absolute_gradients_are_refused_until_nothing_reads_them(session_on):
