@@ -17,8 +17,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor
-
 from fragprune_plugins.errors import (
     HostFailed,
     Interrupted,
@@ -162,15 +160,14 @@ class Stages:
             self.before = self._model(start.iteration, at=start.path)
             first = 0 if line.restarts else start.iteration
             total = first + settings.iterations + line.skipped
-            extra = {"iterations": total, "resume": str(checkpoint)}
-            extra |= self._apart("finetuned" if line.restarts else "")
+            apart = self._apart("finetuned" if line.restarts else "")
+            extra: dict[str, Any] = {"iterations": total, **apart}
             known = None if self.options.again else self._finished(start, self._model(total))
             if known is not None:
                 self.settings, self.after, self.already_finished = known, self._model(total), True
                 return
-            self.settings, kept = self._look(checkpoint)
-            if kept is not None:
-                extra["resume"] = str(starting.part_of(checkpoint, kept, self.scratch))
+            self.settings, resumed = self._look(checkpoint, start.iteration)
+            extra["resume"] = str(resumed)
             arguments = self.host.saving(self.scratch, total, **extra)
             begins = {"start": first, "origin": start.path}
             self._learn(total, arguments, settings=self.settings, **begins)
@@ -205,25 +202,25 @@ class Stages:
             raise HostFailed(error.where, error.found, error.expected, remedy) from error
         self.after = self._model(last)
 
-    def _look(self, checkpoint: Path) -> tuple[Settings, Tensor | None]:
-        """What a look at the model of stage 1 gives; what was asked for without one.
-
-        Args:
-            checkpoint: that the host resumes.
-        """
+    def _look(self, resumed: Path, iteration: int) -> tuple[Settings, Path]:
+        """What a look at the model of stage 1 gives, and the file to resume with what it keeps."""
         settings, before, look = self.options.settings, self.before, self.options.look
         if look is None or before is None:
-            return settings, None
-        host = self.repo, self.host.arguments
+            return settings, resumed
+        host, own = (self.repo, self.host.arguments), self.scratch / "whole" / resumed.name
         try:
             photographs, drawing = self.adapter.photographs(*host), self.adapter.drawing(*host)
-            if starting.holds(checkpoint, before):
-                return look(before, photographs, drawing, settings)
-            why = f"{checkpoint} has other Gaussians than {before}, which its last iteration made"
-        except NotComparedError as error:
+            if not starting.holds(resumed, before):
+                own.parent.mkdir()
+                self.adapter.checkpoint_from_ply(before, iteration, own)
+                log.info("from %s instead: after it, its iteration changed Gaussians", before)
+                resumed = own
+            settings, kept = look(before, photographs, drawing, settings)
+            return settings, starting.part_of(resumed, kept, self.scratch)
+        except (NotComparedError, UsageError) as error:
             why = f"{error.where}: {error.found}"
         log.warning("stage 2 learns as asked, without a look at the model: %s", why)
-        return settings, None
+        return settings, resumed
 
     def _execute(
         self,

@@ -180,12 +180,14 @@ def holds(start: Path, ply: Path) -> bool:
     return any(bool(((each - xyz).abs() <= far).all()) for each in same)
 
 
-def part_of(start: Path, kept: Tensor, folder: Path) -> Path:
-    """A copy of a file that the host can resume, with a part of its Gaussians.
+def part_of(start: Path, kept: Tensor | None, folder: Path) -> Path:
+    """A copy of a file that the host can resume, with a part of its Gaussians; itself for None.
 
     Whatever has a row for each of its N Gaussians keeps those of ``kept``, (N,) bool: parameters,
     their moments, statistics, and what else a fork counts. The copy has the file's name.
     """
+    if kept is None:
+        return start
     target = folder / start.name
     if start.suffix == ".ply":
         ply = PlyData.read(start)

@@ -13,6 +13,7 @@ from miniatures.hosts import HOSTS
 from miniatures.runs import FROZEN, OPTIONS
 from plyfile import PlyData
 
+from fragprune_graphdeco import GraphdecoAdapter
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.injection.launch import run
@@ -115,18 +116,23 @@ def test_a_stage_two_that_a_look_changed_is_finished_when_asked_again(trained):
     assert not run(trained, other).already_finished
 
 
-def test_a_checkpoint_of_other_gaussians_than_the_ply_resumes_whole(photographs, tmp_path, caplog):
-    """The host densifies in the iteration in which it writes both."""
+@pytest.mark.parametrize("resumes_ply", [True, False])
+def test_a_ply_is_resumed_where_the_checkpoint_has_other_gaussians(
+    resumes_ply, photographs, tmp_path, caplog, monkeypatch
+):
+    """The host densifies in the iteration in which it writes both; some cannot resume a PLY."""
+    monkeypatch.setattr(GraphdecoAdapter, "resumes_ply", resumes_ply)
     script, look = runs.written(HOSTS["vanilla-3dgs"], tmp_path / "host") / "train.py", Looked()
     words = runs.command(script, photographs, tmp_path / "out", 10)
-    with caplog.at_level(logging.WARNING, logger="fragprune"):
+    with caplog.at_level(logging.INFO, logger="fragprune"):
         summary = run(words, replace(OPTIONS, look=look))
-    assert look.seen == []
-    assert "without a look at the model" in caplog.text
-    assert summary.gaussians > len(read_ply(summary.model_before).xyz)
+    before, after = (read_ply(p).xyz for p in (summary.model_before, summary.model_after))
+    assert len(look.seen) == resumes_ply
+    assert ("without a look at the model" in caplog.text) != resumes_ply
+    assert torch.equal(after, before[::2]) if resumes_ply else len(after) > len(before)
 
 
-def test_a_checkpoint_whose_rows_are_other_gaussians_resumes_whole(trained, caplog):
+def test_a_ply_is_resumed_where_rows_of_the_checkpoint_are_other_gaussians(trained):
     """3DGS-MCMC relocates in place: as many rows, some of them elsewhere."""
     checkpoint, look = Path(trained[4]) / "chkpnt10.pth", Looked()
     capture, iteration = torch.load(checkpoint, weights_only=False)
@@ -134,9 +140,8 @@ def test_a_checkpoint_whose_rows_are_other_gaussians_resumes_whole(trained, capl
         capture[1][3] += capture[1].max()
     torch.save((capture, iteration), checkpoint)
     summary = run(trained, replace(OPTIONS, stage="finetune", look=look))
-    assert look.seen == []
-    assert "other Gaussians" in caplog.text
-    assert summary.gaussians == len(capture[1])
+    before, after = (read_ply(p).xyz for p in (summary.model_before, summary.model_after))
+    assert torch.equal(after, before[::2])
 
 
 def test_a_control_is_looked_at_as_its_training_is(trained):
