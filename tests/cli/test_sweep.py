@@ -18,7 +18,7 @@ from miniatures.vanilla_3dgs import HOST
 
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.workbench.commands.command import Report
-from fragprune_plugins.workbench.run import started, sweep, work
+from fragprune_plugins.workbench.run import started, sweep
 from fragprune_plugins.workbench.run.recognising import is_sweep
 from fragprune_plugins.workbench.run.sweep import OPTIONS, STOPPED
 
@@ -68,16 +68,6 @@ def test_each_script_of_a_host_is_served_and_other_python_is_python(
     assert "fewer fragments" not in capfd.readouterr().out  # stdout has the object alone
 
 
-def test_a_training_that_fails_fails_the_sweep(tmp_path, monkeypatch):
-    """As ``full_eval.py``, which does not look how its trainings end."""
-    monkeypatch.chdir(HOST)
-    script = script_of(tmp_path, FULL_EVAL.replace('"room", "garden"', '"nothing",'), "all.py")
-    result = run("run", "--device", "cpu", "--", "python", script)
-    assert result.exit_code == 1
-    assert "python train.py -s nothing\n  ended with exit code" in result.stdout
-    assert "0 of 1 commands of a host ended well." in result.stdout
-
-
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_ends_what_was_started_and_nothing_more_starts(
     number, code, fork, photographs, tmp_path
@@ -115,6 +105,7 @@ def test_what_is_left_in_the_background_is_waited_for_and_a_killed_one_is_told(
     result = run("run", "--device", "cpu", "--", script)
     assert result.exit_code == 1, result.stderr
     assert "\n    was killed\n" in result.stdout, result.stdout
+    assert "0 of 1 commands of a host ended well." in result.stdout
 
 
 def test_a_temporary_folder_may_forbid_programs(tmp_path, monkeypatch):
@@ -190,7 +181,7 @@ def test_words_behind_the_script_are_its_own(between, tmp_path, monkeypatch):
         asked.append(([*command], [each for each in options if each != "--"]))
         return Report({}, "")
 
-    monkeypatch.setattr(work, "run_sweep", swept)
+    monkeypatch.setattr("fragprune_plugins.workbench.run.run_sweep", swept)
     run("run", "--quick", *between, "all.sh", "--", "room")
     assert asked == [(["all.sh", "--", "room"], ["--quick"])]
 
@@ -228,6 +219,15 @@ def test_scripts_of_hosts_are_served(words, served, tmp_path, monkeypatch):
     with pytest.raises(SystemExit if served else TakenError):
         started.main(tmp_path, list(map(str, words)))
     assert taken == ([] if served else [[sys.executable, *map(str, words)]])
+
+
+def test_a_training_that_fails_leaves_its_exit_code(tmp_path):
+    (tmp_path / OPTIONS).write_text('["--device", "cpu"]')
+    with pytest.raises(SystemExit) as ended:
+        started.main(tmp_path, [str(HOST / "train.py"), "-s", "nothing"])
+    (run,) = sweep._runs(tmp_path)
+    assert run["exit_code"] == ended.value.code == 1
+    assert sweep._line(run).endswith("train.py -s nothing\n  ended with exit code 1")
 
 
 def test_a_training_that_nothing_serves_is_named_and_runs(tmp_path, monkeypatch):

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import logging
+import sys
 from typing import Any
 
 import click
 
-from fragprune_plugins.workbench.commands.command import Command, Report, work_of
+from fragprune_plugins.errors import UsageError
+from fragprune_plugins.workbench.commands.command import JSON, WORDS, Command, Report, work_of
 from fragprune_plugins.workbench.commands.config import config_option
 from fragprune_plugins.workbench.commands.learning import LEARNING_APART, learning_options
 from fragprune_plugins.workbench.commands.logs import log_option
 from fragprune_plugins.workbench.commands.options import engine_options
 from fragprune_plugins.workbench.commands.rules import Needs
+from fragprune_plugins.workbench.run.recognising import is_sweep
+from fragprune_plugins.workbench.run.sweep import run_sweep
 
 RULES = (
     *LEARNING_APART,
@@ -81,4 +86,12 @@ def command(**options: Any) -> Report:
       fragprune run -- python render.py -m out                       (renders with cutoffs)
       fragprune run -- bash train_all.sh                             (each training in it)
     """
-    return work_of(__name__, **options)
+    if not is_sweep(options["host_command"]):
+        return work_of(__name__, **options)
+    context, script = click.get_current_context(), options["host_command"]
+    if context.params["logs"]:
+        what = " ".join(script)
+        raise UsageError("--log", what, "one training, whose steps it writes", "Leave it out.")
+    logging.basicConfig(level=logging.INFO, format="fragprune: %(message)s", stream=sys.stderr)
+    words = context.meta[WORDS]  # it needs no torch: what it starts imports that
+    return run_sweep(script, words[: len(words) - len(script)], quietly=context.meta[JSON])

@@ -25,7 +25,6 @@ from fragprune_plugins.errors import (
     NotComparedError,
     SidecarError,
     UnknownHostError,
-    UsageError,
     log,
 )
 from fragprune_plugins.files import sidecar
@@ -35,7 +34,7 @@ from fragprune_plugins.injection import launch
 from fragprune_plugins.injection.process import current_gpu
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.types import RasterInputs, RasterOutputs
-from fragprune_plugins.workbench.commands.command import JSON, WORDS, Report
+from fragprune_plugins.workbench.commands.command import JSON, Report
 from fragprune_plugins.workbench.commands.logs import Bar, logging_steps
 from fragprune_plugins.workbench.commands.opening import bound_threads, open_engine
 from fragprune_plugins.workbench.commands.options import EngineOptions
@@ -46,8 +45,6 @@ from fragprune_plugins.workbench.finetune.trial import Trial, tried
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.pruning import kept
 from fragprune_plugins.workbench.run.afterwards import train_then_finetune
-from fragprune_plugins.workbench.run.recognising import is_sweep
-from fragprune_plugins.workbench.run.sweep import run_sweep
 from fragprune_plugins.workbench.run.unserved import Unserved, unserved
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
 from fragprune_plugins.workbench.scenes.generated import views_near
@@ -76,15 +73,7 @@ def run(
     """Do what ``fragprune run`` promises; its options are the arguments."""
     bound_threads(engine.threads)
     logging.basicConfig(level=logging.INFO, format="fragprune: %(message)s", stream=sys.stderr)
-    context = click.get_current_context()
-    as_json = context.meta[JSON]
-    if is_sweep(host_command):
-        if context.params["logs"]:
-            what = " ".join(host_command)
-            raise UsageError("--log", what, "one training, whose steps it writes", "Leave it out.")
-        words = context.meta[WORDS]
-        ours = words[: len(words) - len(host_command)]
-        return run_sweep(host_command, ours, quietly=as_json)
+    as_json = click.get_current_context().meta[JSON]
     looking = Looking(engine)
     options = launch.RunOptions(
         adapter=adapter,
