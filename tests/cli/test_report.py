@@ -28,6 +28,23 @@ def finetuned(tmp_path_factory):
     return folder, run_json("finetune", model, "--out", folder / "out" / "pruned.ply", *words)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _curves_once():
+    """The same curves are drawn once, which takes half a second."""
+    draw, drawn = report_page.save_learning, {}
+
+    def given(path, curves, thresholds):
+        kind = thresholds is None, repr(curves)
+        if kind not in drawn:
+            draw(path, curves, thresholds)
+            drawn[kind] = path.read_bytes()
+        path.write_bytes(drawn[kind])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report_page, "save_learning", given)
+        yield
+
+
 @pytest.fixture
 def out(finetuned, tmp_path):
     """What it left, in a copy of that folder: a record names files beside its own."""

@@ -4,8 +4,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 
 import pytest
 from cli.commands import fails, run, run_json
@@ -16,6 +14,7 @@ from miniatures.vanilla_3dgs import HOST
 
 from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
+from fragprune_plugins.workbench.commands import cli
 from fragprune_plugins.workbench.figures.records import beside, recorded
 
 TRAINING = """
@@ -181,12 +180,20 @@ def test_a_signal_ends_the_training_too(number, code, host, photographs):
     words = host(photographs)
     script = words[2]
     script.write_text(f"{script.read_text()}\n".replace("import os", WAITING, 1))
-    line = [sys.executable, "-m", "fragprune_plugins", "run", *map(str, (*WORDS, *words))]
-    how = {"stdout": subprocess.PIPE, "text": True, "start_new_session": True}
-    with subprocess.Popen(line, **how, preexec_fn=hear_ctrl_c) as run_:
-        pid = int(run_.stdout.readline())
-        os.killpg(run_.pid, number) if number == signal.SIGINT else run_.send_signal(number)
-        assert run_.wait(60) == code
+    read, write = os.pipe()
+    group = os.fork()
+    if not group:  # as a terminal starts it; torch is here already
+        os.setsid()
+        os.dup2(write, 1)
+        hear_ctrl_c()
+        with pytest.raises(SystemExit) as ended:
+            cli.main(["run", *map(str, (*WORDS, *words))])
+        os._exit(ended.value.code)
+    os.close(write)
+    with os.fdopen(read) as said:
+        pid = int(said.readline())
+        os.killpg(group, number) if number == signal.SIGINT else os.kill(group, number)
+        assert os.waitstatus_to_exitcode(os.waitpid(group, 0)[1]) == code
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
 
