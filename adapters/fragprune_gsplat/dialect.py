@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from types import ModuleType
 from typing import Any
 
@@ -185,9 +185,10 @@ class GsplatDialect(Dialect):
     def answer(
         self, call: HostCall, inputs: RasterInputs, draw: Callable[..., RasterOutputs]
     ) -> Any:
-        """Draw one camera after another."""
+        """Draw one camera after another, each by the model's rules."""
         assert isinstance(inputs, Cameras)
-        drawn = [draw(each, part) for part, each in enumerate((inputs, *inputs.others))]
+        others = (replace(each, stop=inputs.stop, rim=inputs.rim) for each in inputs.others)
+        drawn = [draw(each, part) for part, each in enumerate((inputs, *others))]
         return self._pack(drawn, inputs, call)
 
     def _pack(self, drawn: list[RasterOutputs], inputs: Cameras, call: HostCall) -> Any:

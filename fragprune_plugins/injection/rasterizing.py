@@ -160,7 +160,6 @@ def on_rasterize(session: SessionState, call: SeamCall) -> Any:
             view = rendering[1]
 
             def truncated(each: RasterInputs, part: int = 0) -> RasterOutputs:
-                each = replace(each, **state.store.rules)  # another camera of the call has none
                 picture = (view[part], 0) if isinstance(view, tuple) else (view, part)
                 return rasterize(engine, state, picture, thresholds, each)
 

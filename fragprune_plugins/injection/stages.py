@@ -213,7 +213,7 @@ class Stages:
             if not starting.holds(resumed, before):
                 own.parent.mkdir()
                 self.adapter.checkpoint_from_ply(before, iteration, own)
-                log.info("from %s instead: after it, its iteration changed Gaussians", before)
+                log.info("from %s instead: its iteration changed Gaussians after that", before)
                 resumed = own
             settings, kept = look(before, photographs, drawing, settings)
             return settings, starting.part_of(resumed, kept, self.scratch)

@@ -226,15 +226,15 @@ def test_a_proof_sees_every_value_beside_its_own_channel(scene, objects):
 def test_only_the_first_picture_of_a_view_in_a_step_is_pressed():
     state = ModelState(ThresholdStore(3))
     state.steps = 1
-    assert not further_picture(state, 5, 0)
-    assert further_picture(state, 5, 0)
-    assert not further_picture(state, 6, 0)
-    assert not further_picture(state, 5, 1)
-    assert further_picture(state, 6, 0)
+    assert not further_picture(state, (5, 0))
+    assert further_picture(state, (5, 0))
+    assert not further_picture(state, (6, 0))
+    assert not further_picture(state, (5, 1))
+    assert further_picture(state, (6, 0))
     with torch.no_grad():
-        assert not further_picture(state, 5, 0)
+        assert not further_picture(state, (5, 0))
     state.steps = 2
-    assert not further_picture(state, 5, 0)
+    assert not further_picture(state, (5, 0))
 
 
 def test_no_depth_and_no_normal_is_left_to_tf32(scene, objects):

@@ -54,7 +54,7 @@ def test_the_line_has_frame_times_and_says_that_no_control_was_run(scene, tmp_pa
     result = run("run", *WORDS, *command(scene, tmp_path / "out"))
     assert caplog.text.count("nothing is proved") == 1  # not once in each stage
     assert result.exit_code == 0, result.stderr
-    (line,) = (line for line in result.stdout.splitlines() if "x fewer fragments" in line)
+    (line,) = (line for line in result.stdout.splitlines() if " per pixel), frames " in line)
     assert " ms (" in line
     assert "no control was found; to see, add --stage finetune --control" in line
 
