@@ -157,7 +157,7 @@ class Vanilla3DGS(GraphdecoAdapter):
         if ply.suffix == ".ply":
             folder = ply.parents[2]
         else:
-            ply = self.model_file(folder, int(re.sub(r"\D", "", start.stem)))
+            ply = self.model_file(folder, int(re.sub(r"\D", "", start.stem) or 0))
         kept = _kept(ply)
         if kept is None and not (folder / "exposure.json").exists():
             return

@@ -211,7 +211,7 @@ class Stages:
         try:
             photographs, drawing = self.adapter.photographs(*host), self.adapter.drawing(*host)
             if not starting.holds(resumed, before):
-                own.parent.mkdir()
+                own.parent.mkdir(exist_ok=True)
                 self.adapter.checkpoint_from_ply(before, iteration, own)
                 log.info("from %s instead: its iteration changed Gaussians after that", before)
                 resumed = own

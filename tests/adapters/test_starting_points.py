@@ -282,3 +282,10 @@ def test_exposures_are_those_of_the_start_also_after_stage_two(tmp_path):
     os.utime(starts[1], (later, later))  # trained again
     assert shown() == 1.0
     assert begun(5, starts[0]) == 5.0
+
+
+def test_exposures_are_restored_beside_a_checkpoint_of_any_name(tmp_path):
+    (tmp_path / "exposure.json").write_text(json.dumps({"a": (2 * torch.eye(3, 4)).tolist()}))
+    model = SimpleNamespace(exposure_mapping={"a": 0}, _exposure=torch.eye(3, 4)[None])
+    Vanilla3DGS().prepare_stage2(model, tmp_path / "final.pth")
+    assert torch.equal(model._exposure[0], 2 * torch.eye(3, 4))

@@ -134,7 +134,8 @@ def _of_other_options(summary: launch.RunSummary, command: Sequence[str]) -> boo
     if not summary.already_finished or not summary.model_after:
         return False
     record = records.beside(summary.model_after)
-    return record is not None and record.data.get("host_options") != _options(command)
+    then = record and record.data.get("host_options")
+    return then is not None and then != _options(command)
 
 
 def _not_compared(summary: launch.RunSummary) -> FragpruneError | None:
@@ -154,18 +155,18 @@ def _expect_thresholds(summary: launch.RunSummary, settings: Settings) -> None:
     model, folder = summary.model_after, summary.output
     if not (summary.steps and settings.goal.learns and folder):
         return
-    left = sorted(folder.rglob(f"*{sidecar.SUFFIX}"))
-    if model is None:
-        if left or _in_checkpoints(folder):
-            return
-        found = "no model was saved when stage 2 had ended"
-        remedy = "Have the host save its model at its last iteration, and run it again."
-    elif model.suffix != ".ply" or sidecar.find(model):  # a checkpoint holds them itself
+    if model and (model.suffix != ".ply" or sidecar.find(model)):  # a checkpoint holds them itself
         return
-    else:
+    left = sorted(folder.rglob(f"*{sidecar.SUFFIX}"))
+    if model:
         found = f"{sidecar.path_beside(model).name} is not beside it"
         found += f"; in the folder there is {left[-1]}" if left else ""
         remedy = "Look where the host moved the model that it saved, and move the thresholds there."
+    elif left or _in_checkpoints(folder):
+        return
+    else:
+        found = "no model was saved when stage 2 had ended"
+        remedy = "Have the host save its model at its last iteration, and run it again."
     raise SidecarError(str(model or folder), found, "the thresholds that were learned", remedy)
 
 
