@@ -151,6 +151,8 @@ class Stages:
             expected = "--from-iter, the iteration of one run after which stage 2 begins"
             remedy = "Add it, or give the trained PLY to fragprune finetune."
             raise UsageError("--stage finetune", found, expected, remedy)
+        if not settings.goal.presses:  # begins where the run that it is for began to learn
+            self.start = self.start or starting.ended(self.adapter, self.host)
         self.host = self.host.of(*self.adapter.resumed_by(self.host.script, self.host.arguments))
         self.output = self.output or self.host.output
         start = self.start = self.start or starting.find(self.adapter, self.host, self.output)

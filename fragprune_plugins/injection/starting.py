@@ -100,6 +100,15 @@ def trains_on(host: HostCommand) -> bool:
     return resumed_at(line, path) < host.iterations and not _learned(path)
 
 
+def ended(adapter: ScriptAdapter, host: HostCommand) -> Start | None:
+    """The end of the training that a command goes on with from a file; None if it has none yet."""
+    if host.flags.resume and trains_on(host):
+        for iteration, path in reversed(files(adapter, host.output)):
+            if iteration == host.iterations:
+                return Start(iteration, path, "the end of the training that the control is for")
+    return None
+
+
 def files(adapter: ScriptAdapter, output: Path | None) -> list[tuple[int, Path]]:
     """(iteration, file) of every model in an output folder, the newest last."""
     return adapter.saved_iterations(output) if output else []

@@ -131,6 +131,7 @@ def test_a_training_that_was_broken_off_is_ended_before_stage_two(photographs, o
     line = started(out, 10, *named, options=OPTIONS)
     assert line.endswith(f"iteration 10, {out / 'chkpnt10.pth'}: the end of stage 1")
     assert "iteration 5," in started(out, 10, *named)  # stage 2 alone
+    assert f"iteration 10, {out / 'chkpnt10.pth'}:" in started(out, 10, *named, options=CONTROL)
     for ended in ("chkpnt10.pth", ply(10)):
         line = started(out, 10, "--start_checkpoint", out / ended, options=OPTIONS)
         assert line.endswith(f"iteration 10, {out / ended}: the command names it")
