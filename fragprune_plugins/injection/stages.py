@@ -269,6 +269,7 @@ class Stages:
             session.expect_drawn()
         finally:
             self.output = session.output or self.output
+            self.host.name_config(self.scratch, self.output)
             process.forget_modules(self.repo.root, known, self.adapter.installed)
             gc.collect()  # closes objects of module globals, such as the viewer's socket
             if learn:

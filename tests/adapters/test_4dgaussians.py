@@ -233,6 +233,8 @@ def test_the_file_wins_and_stage_2_ends_where_it_should(mmcv, mini, photographs,
     assert load(tmp_path / "out" / f"chkpnt_fine_{LAST}.pth")[1] == LAST
     assert network(summary.model_after)["grid_planes"].shape == (4, 4)
     assert config.read_text() == text
+    arguments = (tmp_path / "out" / "cfg_args").read_text()  # what the host's render.py reads
+    assert f"configs={str(config)!r}" in arguments
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # mmcv's own

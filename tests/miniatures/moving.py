@@ -233,6 +233,7 @@ def scene_reconstruction(opt, pipe, gaussians, scene, stage, train_iter, white):
 def training(dataset, opt, pipe):
     """Two phases in one process."""
     dataset.model_path = args.model_path or os.path.join("output", args.expname)  # noqa: F821
+    dataset.configs = args.configs  # noqa: F821 - it keeps all of its arguments
     prepare_output_and_logger(dataset)  # noqa: F821
     hidden = Namespace(net_width=args.net_width, resolution=args.resolution_t)  # noqa: F821
     gaussians = GaussianModel(dataset.sh_degree, hidden)  # noqa: F821
