@@ -93,16 +93,6 @@ class HostCommand:
             out += [self.line.config.flag, str(copy)]
         return out
 
-    def name_config(self, scratch: Path, output: Path | None) -> None:
-        """Name the host's own configuration file where the arguments that it kept name a copy.
-
-        Its other scripts read these again, when the copy is gone.
-        """
-        config, kept = self.line.config and self.flags.config, output and output / "cfg_args"
-        if config and kept and kept.is_file():
-            copy = repr(str(scratch / config.name)).encode()
-            kept.write_bytes(kept.read_bytes().replace(copy, repr(str(config)).encode()))
-
 
 def split(command: list[str], *, quietly: bool = False) -> tuple[Path, list[str], str]:
     """(script, arguments, module) of a command; a leading interpreter is dropped.

@@ -62,14 +62,11 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
     trains = _expect_trainable(host, repo, trainer, options, device)
     with tempfile.TemporaryDirectory(prefix="fragprune-") as scratch:
         stages = Stages(host, repo, trainer, plugins, options, device, Path(scratch))
-        if not trains or options.stage == "off":
-            stages.observe()
-        elif options.stage == "joint":
-            stages.joint()
-        elif options.stage == "finetune":
-            stages.finetune()
-        else:
-            stages.train_then_finetune()
+        named = {"off": stages.observe, "joint": stages.joint, "finetune": stages.finetune}
+        named.get(options.stage if trains else "off", stages.train_then_finetune)()
+        own = str(host.flags.config or "") if host.line.config else ""
+        for kept in stages.output.glob("cfg_args") if own and stages.output else ():
+            kept.write_text(kept.read_text().replace(f"{scratch}/{Path(own).name}", own))
     return stages.summary(time.perf_counter() - started)
 
 

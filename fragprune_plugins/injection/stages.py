@@ -142,8 +142,7 @@ class Stages:
         """Run stage 2: resume a model, or begin at ``from_iter`` of one run."""
         settings = self.options.settings
         if self.options.from_iter is not None:
-            self._learn_within(self.options.from_iter)
-            return
+            return self._learn_within(self.options.from_iter)
         if self.host.line.one_run:
             if not settings.goal.presses:  # a control trains as long as the run that it is for
                 return self.one_run()
@@ -151,7 +150,7 @@ class Stages:
             expected = "--from-iter, the iteration of one run after which stage 2 begins"
             remedy = "Add it, or give the trained PLY to fragprune finetune."
             raise UsageError("--stage finetune", found, expected, remedy)
-        if not settings.goal.presses:  # begins where the run that it is for began to learn
+        if not settings.goal.presses:  # a control begins where what it is for did
             self.start = self.start or starting.ended(self.adapter, self.host)
         self.host = self.host.of(*self.adapter.resumed_by(self.host.script, self.host.arguments))
         self.output = self.output or self.host.output
@@ -171,8 +170,7 @@ class Stages:
             self.settings, resumed = self._look(checkpoint, start.iteration)
             extra["resume"] = str(resumed)
             arguments = self.host.saving(self.scratch, total, **extra)
-            begins = {"start": first, "origin": start.path}
-            self._learn(total, arguments, settings=self.settings, **begins)
+            self._learn(total, arguments, settings=self.settings, start=first, origin=start.path)
 
     def _apart(self, own: str = "") -> dict[str, str]:
         """Save what learns in this folder in the output folder, a control always in one of its own.
@@ -187,7 +185,6 @@ class Stages:
     def _learn(self, last: int, arguments: list[str], **options: Any) -> None:
         """Run the host's script with learning on; the result is its model of iteration ``last``."""
         started = time.time() - 0.1  # a file has the time of the last tick of the clock
-
         kept = partial(self._model, last, started)
 
         def ended(session: Session) -> None:
@@ -269,7 +266,6 @@ class Stages:
             session.expect_drawn()
         finally:
             self.output = session.output or self.output
-            self.host.name_config(self.scratch, self.output)
             process.forget_modules(self.repo.root, known, self.adapter.installed)
             gc.collect()  # closes objects of module globals, such as the viewer's socket
             if learn:

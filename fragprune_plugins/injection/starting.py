@@ -72,14 +72,13 @@ def find(adapter: ScriptAdapter, host: HostCommand, output: Path | None) -> Star
     while saved and _learned(saved[-1][1]):
         saved.pop()
         newer += 1
-    if not saved and newer:
-        found, expected = "only results of stage 2 or of a control", "a file of the host's training"
-        remedy = f"To continue from one of these files, name it with {flag}."
-        raise UsageError("--stage finetune", f"{found} in {where}", expected, remedy)
     if not saved:
-        expected = f"{flag} FILE, or {host.line.output[-1]} DIR of a finished training"
+        found, expected = "no model", f"{flag} FILE, or {host.line.output[-1]} DIR of a training"
         remedy = "Add one of these flags to the host's command."
-        raise UsageError("--stage finetune", f"no model in {where}", expected, remedy)
+        if newer:
+            found, expected = "only results of stage 2 or of a control", "one of a training"
+            remedy = f"To continue from one of these files, name it with {flag}."
+        raise UsageError("--stage finetune", f"{found} in {where}", expected, remedy)
     iteration, path = saved[-1]
     later = [(at, file) for at, file in saved if at > iteration and not _learned(file)]
     if later:
@@ -101,12 +100,10 @@ def trains_on(host: HostCommand) -> bool:
 
 
 def ended(adapter: ScriptAdapter, host: HostCommand) -> Start | None:
-    """The end of the training that a command goes on with from a file; None if it has none yet."""
-    if host.flags.resume and trains_on(host):
-        for iteration, path in reversed(files(adapter, host.output)):
-            if iteration == host.iterations:
-                return Start(iteration, path, "the end of the training that the control is for")
-    return None
+    """The end of a training that begins with a file of another; None if there is none yet."""
+    begins = host.script.name in host.line.continues or (host.flags.resume and trains_on(host))
+    ends = [path for at, path in files(adapter, host.output) if begins and at == host.iterations]
+    return Start(host.iterations, ends[-1], "the end of its training") if ends else None
 
 
 def files(adapter: ScriptAdapter, output: Path | None) -> list[tuple[int, Path]]:
@@ -117,8 +114,7 @@ def files(adapter: ScriptAdapter, output: Path | None) -> list[tuple[int, Path]]
 def remember(start: Start, host: HostCommand, commit: str) -> None:
     """Mark stage 1 as finished, so that the same command need not repeat it; see ``finished``.
 
-    Args:
-        host: its command. Without an output folder in it there is no mark.
+    Without an output folder in its command there is no mark.
     """
     if host.output is not None and host.output.is_dir():
         with replacing(host.output / FINISHED) as mark:
@@ -130,8 +126,7 @@ def finished(adapter: ScriptAdapter, host: HostCommand, commit: str) -> Start | 
 
     None if the command, the host or the file is another one by now.
     """
-    mark = host.output / FINISHED if host.output else None
-    if mark is None or not mark.is_file():
+    if host.output is None or not (mark := host.output / FINISHED).is_file():
         return None
     known = mark.read_text(errors="replace")
     for iteration, path in files(adapter, host.output):

@@ -2,6 +2,7 @@
 
 import copy
 import shutil
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,6 +17,7 @@ from miniatures.vanilla_3dgs import expect_ancestors, joint, label, running
 from oracle import naive
 
 from fragprune_light_gaussian import LightGaussian
+from fragprune_plugins import Control
 from fragprune_plugins.adapting import hookimpl, read_ply
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.hosts.adapter import optimizer_state
@@ -143,6 +145,9 @@ def test_pruning_is_stage_one_of_its_own_script(mini, photographs, trained, tmp_
     assert frozen_differences(again.model_before, again.model_after) == []
     stage1, stage2 = (sidecar.load(path)[0] for path in (again.model_before, again.model_after))
     assert (stage1.steps, stage2.steps) == (8, 16)  # thresholds came along and learned on
+    settings = replace(OPTIONS.settings, goal=Control())
+    control = run(words, replace(OPTIONS, stage="finetune", settings=settings))
+    assert (control.model_before, control.gaussians) == (again.model_before, again.gaussians)
 
 
 def test_a_checkpoint_made_of_a_point_cloud_has_the_hosts_weight_decay(trained, tmp_path):
