@@ -24,6 +24,7 @@ NESTING = 64
 """Most levels of a JSON value; what we read has six at most."""
 
 _SAID = 200  # characters of a parser's own words
+_POINTER = b"version https://git-lfs.github.com/"  # begins what git leaves in a large file's place
 
 
 class _Bounded(io.BufferedReader):
@@ -118,6 +119,8 @@ class UntrustedFile:
             if reading.size > self.limit:
                 found = f"{reading.size} bytes, more than such a file has"
                 raise self.error(str(path), found, f"at most {self.limit} bytes", self.remedy)
+            if file.peek().startswith(_POINTER):
+                raise self.error(str(path), "git's pointer", self.expected, "Run: git lfs pull")
             yield reading
 
     @contextlib.contextmanager
@@ -137,7 +140,7 @@ class UntrustedFile:
             found = f"{self.broken}{at} ({message_of(error)})"
             raise self.error(str(path), found, self.expected, self.remedy) from error
 
-    def _open(self, path: Path) -> BinaryIO:
+    def _open(self, path: Path) -> _Bounded:
         """Open a regular file without waiting for anything."""
         try:
             self._expect_regular(path, path.stat().st_mode)  # opening a device may do something

@@ -450,6 +450,13 @@ def test_a_file_that_cannot_be_opened_is_named_with_the_reason(tmp_path, monkeyp
     assert caught.value.found == f"cannot be opened ({why})"
 
 
+def test_what_git_lfs_left_in_a_files_place_is_told(tmp_path):
+    path = tmp_path / "model.ply"
+    path.write_text(f"version https://git-lfs.github.com/spec/v1\noid sha256:{'0' * 64}\nsize 9\n")
+    with pytest.raises(ModelFileError, match=r"git's pointer; .* Run: git lfs pull"):
+        read_ply(path)
+
+
 def test_a_name_that_no_file_has_lies_nowhere(tmp_path):
     assert lies_in(tmp_path / "a", tmp_path)
     assert not lies_in(tmp_path / ".." / "a", tmp_path)

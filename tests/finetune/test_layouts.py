@@ -159,6 +159,17 @@ def test_a_photograph_that_lies_on_its_side_is_told_to_be_turned(colmap):
         load_dataset(colmap)
 
 
+@pytest.mark.parametrize(("turn", "warned"), [(1, False), (3, True), (6, True)])
+def test_photographs_that_exif_turns_in_their_own_shape_are_warned_of(colmap, turn, warned, caplog):
+    path = colmap / "images" / "view03.png"
+    exif = Image.Exif()
+    exif[0x0112] = turn
+    Image.open(path).save(path.with_suffix(".jpg"), exif=exif)
+    path.unlink()
+    load_dataset(colmap)
+    assert ("1 photographs have an EXIF orientation" in caplog.text) == warned
+
+
 def test_smaller_images_may_be_rounded_to_a_pixel(colmap):
     """An eighth of 180 rows is 22.5: 2 % of the aspect."""
     (colmap / "sparse" / "0" / "cameras.txt").write_text("7 PINHOLE 320 180 360 360 160 90\n")
@@ -194,6 +205,49 @@ def test_images_under_another_suffix_are_found(colmap, suffix):
     shot = load_dataset(colmap).train[0]
     assert shot.path.suffix == suffix
     assert shot.image.shape == (3, tiny.SIDE, tiny.SIDE)
+
+
+def test_names_in_another_case_are_found_where_no_other_has_them(colmap):
+    for path in list((colmap / "images").iterdir()):
+        path.rename(path.with_name(path.name.upper()))
+    assert stems(load_dataset(colmap).train) == NAMES[1:8]
+    (colmap / "images" / "View03.png").touch()
+    with pytest.raises(DatasetError, match=r"view03\.png: no such image"):
+        load_dataset(colmap)
+
+
+def test_colmaps_text_may_come_from_windows(colmap):
+    """With its mark at the beginning, its line ends and its backslashes."""
+    (colmap / "images" / "left").mkdir()
+    for name in NAMES:
+        path = colmap / "images" / f"{name}.png"
+        path.rename(path.parent / "left" / path.name)
+    for path in (colmap / "sparse" / "0").iterdir():
+        text = path.read_text().replace("view", "left\\view")
+        path.write_text(text, encoding="utf-8-sig", newline="\r\n")
+    shot = load_dataset(colmap).train[0]
+    assert shot.name == "left/view01.png"
+    assert shot.path == colmap / "images" / shot.name
+
+
+@pytest.mark.parametrize("folder", ["images\\", ".\\images\\", "C:\\scene\\images\\", "/home/x/"])
+def test_transforms_of_another_machine_list_the_images_beside_them(tmp_path, images, folder):
+    path = write_nerfstudio(tmp_path, images, test_filenames=["images/view01.png"])
+    named = json.dumps(folder)[1:-1]
+    path = path / "transforms.json"
+    path.write_text(path.read_text().replace("images/", named))
+    data = load_dataset(tmp_path)
+    assert [shot.path for shot in data.test] == [tmp_path / "images" / "view01.png"]
+    assert len(data.train) == 8
+
+
+def test_four_parameters_of_a_fisheye_are_its_coefficients(tmp_path, images):
+    more = {"camera_model": "opencv_fisheye", "fl_x": 36.0}
+    write_nerfstudio(tmp_path, images, **more, distortion_params=[0.1, 0.02, 0, 0])
+    assert load_dataset(tmp_path).train[0].lens.coefficients == (0.1, 0.02, 0, 0)
+    write_nerfstudio(tmp_path, images, fl_x=36.0, distortion_params=[0.1, 0, 0, 0])
+    with pytest.raises(DatasetError, match="4 distortion_params, not k1, k2, k3, k4, p1, p2"):
+        load_dataset(tmp_path)
 
 
 def test_two_images_of_one_stem_are_not_guessed_between(colmap):

@@ -107,7 +107,8 @@ def read(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]
         cameras = dict(parsers[0](reading))
     rows = []
     with _FILE.reading(found[1]) as reading:
-        for name, camera_id, quaternion, translation in parsers[1](reading):
+        for listed, camera_id, quaternion, translation in parsers[1](reading):
+            name = listed.replace("\\", "/")  # of a model made on Windows
             if camera_id not in cameras:
                 raise DatasetError(
                     str(model),
@@ -175,8 +176,8 @@ def _text_lines(reading: Reading) -> Iterator[str]:
     """The lines of a text file that are no comments; empty ones too."""
     for number, line in enumerate(reading.file, start=1):
         reading.place = f"line {number}"
-        if not line.startswith(b"#"):
-            yield line.decode("utf-8")
+        if not (text := line.decode("utf-8-sig")).startswith("#"):
+            yield text
 
 
 def _cameras_text(reading: Reading) -> Iterator[tuple[int, Lens]]:

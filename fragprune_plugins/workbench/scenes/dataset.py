@@ -21,7 +21,7 @@ from fragprune_plugins.files.reading import MEBIBYTE
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.types import View, one_line
 from fragprune_plugins.workbench.scenes import colmap, transforms
-from fragprune_plugins.workbench.scenes.images import SUFFIXES, image_size, opened
+from fragprune_plugins.workbench.scenes.images import SUFFIXES, image_size, opened, turned
 from fragprune_plugins.workbench.scenes.pinhole import Camera
 from fragprune_plugins.workbench.scenes.posed import Lens, Posed
 
@@ -321,6 +321,13 @@ def load_dataset(
             "its descendants ignore: figures of their models are wrong, unless these lie in their "
             "output folder, with cfg_args, or finetune made them",
             *(printable(str(folder)), off),
+        )
+    if lying := [row.image for part in rows for row in part if turned(row.image)]:
+        log.warning(
+            "%s: %d photographs have an EXIF orientation, such as %s. Their pixels are read as "
+            "they are stored, as COLMAP and hosts read them. If the program that found the cameras "
+            "turned them, turn their pixels, too (exiftran -ai)",
+            *(printable(str(folder)), len(lying), printable(str(lying[0]))),
         )
     if dataset.leaked:
         log.warning(

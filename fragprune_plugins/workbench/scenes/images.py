@@ -19,6 +19,8 @@ PIXELS_MAX = 160_000_000
 _FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 """All that Pillow may take a file for. Some of its other readers run programs."""
 
+_ORIENTATION = 0x0112  # of EXIF
+
 _CUT = ("I", "F")
 """Modes besides 16-bit grey whose values Pillow cuts at 255: a bright photograph is white then."""
 
@@ -39,16 +41,18 @@ def find_image(path: Path) -> Path:
     """The image file that a scene lists: the path, or one of its folder and stem.
 
     Scenes list images without a suffix (Blender's), or with that of the images before they were
-    made smaller or renamed (.JPG, .png). If there is no file, or more than one, it is the path.
+    made smaller or renamed (.JPG, .png), or in another case, which other systems do not tell apart.
+    If there is no file, or more than one, it is the path.
     """
     if path.is_file():
         return path
     stem = path.stem if path.suffix.lower() in SUFFIXES else path.name
     try:
-        beside = [each for each in path.parent.iterdir() if each.stem == stem]
+        images = [each for each in path.parent.iterdir() if each.suffix.lower() in SUFFIXES]
     except OSError:
         return path
-    found = [each for each in beside if each.suffix.lower() in SUFFIXES]
+    found = [each for each in images if each.stem == stem]
+    found = found or [each for each in images if each.stem.casefold() == stem.casefold()]
     return found[0] if len(found) == 1 else path
 
 
@@ -78,3 +82,12 @@ def image_size(path: Path) -> tuple[int, int]:
     """Width and height of an image file, pixels. Only its header is read."""
     with opened(path) as image:
         return image.size
+
+
+def turned(path: Path) -> bool:
+    """Whether EXIF turns an image without another aspect, which would show in its camera."""
+    with contextlib.suppress(DatasetError), opened(path) as image:
+        if "exif" in image.info:  # elsewhere Pillow decodes the image to look for it
+            turn = image.getexif().get(_ORIENTATION, 1)
+            return turn in (2, 3, 4) or (turn in (5, 6, 7, 8) and image.width == image.height)
+    return False

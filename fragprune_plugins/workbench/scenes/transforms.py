@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import torch
@@ -139,8 +139,13 @@ def opengl_pose(to_world: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 def _listed(file: str) -> Path:
     """A path that a transforms file lists, to compare with others: its suffix may differ."""
-    path = Path(file)
+    path = _path(file)
     return path.with_name(_name(path))
+
+
+def _path(file: str) -> Path:
+    """A path that a transforms file lists, which may have been written on Windows."""
+    return Path(PureWindowsPath(file).as_posix())
 
 
 def _name(image: Path) -> str:
@@ -148,7 +153,10 @@ def _name(image: Path) -> str:
 
 
 def _row(folder: Path, frame: dict[str, Any], images: str) -> Posed:
-    listed = Path(frame["file_path"])
+    listed = _path(frame["file_path"])
+    if PureWindowsPath(listed).anchor and not find_image(folder / listed).exists():
+        # It was listed on another machine.
+        listed = Path("images", listed.name)
     image = find_image(folder / (listed if images == "images" else Path(images) / listed.name))
     known = "fl_x" in frame
     # Pixels of the listed image; an angle is the same in an image of any size.
@@ -172,7 +180,7 @@ def _row(folder: Path, frame: dict[str, Any], images: str) -> Posed:
 
 def _distortion(frame: dict[str, Any]) -> tuple[bool, tuple[float, ...]]:
     """Whether a frame's lens is a fisheye, and its coefficients in OpenCV's order."""
-    model = str(frame.get("camera_model", ""))
+    model = str(frame.get("camera_model", "")).upper()
     if model not in (*_PINHOLES, *_BENT, *_FISHEYES):
         raise DatasetError(
             str(frame["file_path"])[:200],
@@ -180,12 +188,15 @@ def _distortion(frame: dict[str, Any]) -> tuple[bool, tuple[float, ...]]:
             f"one of {', '.join((*_PINHOLES[1:], *_BENT, *_FISHEYES))}",
             "Undistort the images first (colmap image_undistorter).",
         )
+    fisheye = model in _FISHEYES or bool(frame.get("is_fisheye"))
     if "distortion_params" in frame:  # nerfstudio's, which go before the names
-        names = ("k1", "k2", "k3", "k4", "p1", "p2")
-        frame = frame | dict(zip(names, frame["distortion_params"], strict=True))
+        names, values = ("k1", "k2", "k3", "k4", "p1", "p2"), frame["distortion_params"]
+        if len(values) != len(names) and not (len(values) == 4 and fisheye):
+            raise ValueError(f"{len(values)} distortion_params, not {', '.join(names)}")
+        frame = frame | dict(zip(names, values, strict=False))
     k1, k2, p1, p2, k3, k4, k5, k6 = (
         float(frame.get(key, 0)) for key in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
     )
-    if model in _FISHEYES or frame.get("is_fisheye"):
+    if fisheye:
         return True, (k1, k2, k3, k4)
     return False, (k1, k2, p1, p2, k3, k4, k5, k6)
