@@ -24,6 +24,14 @@ def test_a_file_never_takes_the_place_of_a_closed_stream(tmp_path, numbers):
     assert (tmp_path / MODULE.name).read_bytes() == MODULE.read_bytes()
 
 
+def test_a_stream_that_takes_nothing_is_a_closed_one():
+    """As ``nice`` leaves it, where it was closed."""
+    words = [sys.executable, "-m", "fragprune_plugins", "adapters"]
+    with open(os.devnull) as null:
+        done = subprocess.run(words, stdout=null, stderr=subprocess.PIPE, timeout=100)
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
 def test_letters_that_a_stream_cannot_write_become_escapes(tmp_path):
     done = bridge(tmp_path / "\u2192", env=os.environ | {"PYTHONIOENCODING": "latin-1"})
     assert done.returncode == 0

@@ -70,16 +70,17 @@ def cli() -> None:
 
 
 def _open_missing_streams() -> None:
-    """Open /dev/null for each of stdin, stdout and stderr that is closed.
+    """Open /dev/null for each of stdin, stdout and stderr that is closed, or that takes nothing.
 
     Else a file that is opened later would get its descriptor, and with it what is printed. A letter
     that a stream cannot encode becomes an escape.
     """
     for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
         try:
-            os.fstat(number)
-        except OSError:
-            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+            os.fstat(number) if mode == "r" else os.write(number, b"")  # nice opens it for reading
+        except OSError as error:
+            if error.errno == errno.EBADF:
+                os.dup2(os.open(os.devnull, os.O_RDWR), number)
         if getattr(sys, name) is None:
             setattr(sys, name, open(number, mode, encoding="utf-8", closefd=False))  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):
