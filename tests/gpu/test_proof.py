@@ -15,7 +15,7 @@ class Changed(EmulatedDevice):
     """Takes one of its sources from another folder."""
 
     def __init__(self, device: EmulatedDevice, source: Path) -> None:
-        super().__init__(device.compiler, device._folder, (f"-I{kernels.SOURCES}",))
+        super().__init__(device.compiler, device.folder, (f"-I{kernels.SOURCES}",))
         self._changed = source
 
     def source(self, name: str) -> Path:

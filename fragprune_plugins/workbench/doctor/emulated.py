@@ -53,7 +53,7 @@ class EmulatedDevice:
     kind = "cpu"
 
     def __init__(self, compiler: str, folder: Path, flags: tuple[str, ...] = ()) -> None:
-        self.compiler, self._folder, self._flags = compiler, folder, flags
+        self.compiler, self.folder, self._flags = compiler, folder, flags
         self.seed = 1  # of the order in which threads and blocks run
         self.resident = 3  # blocks that run at a time, 1 to 3
         self.launched: list[tuple[str, dict[str, int]]] = []  # kernels with their macros, in order
@@ -90,7 +90,7 @@ class EmulatedDevice:
         key = (source, tuple(sorted(macros.items())))
         if key not in self.opened:
             name = hashlib.sha256(repr((self.source(source), key)).encode()).hexdigest()[:16]
-            path = self._folder / f"{source}-{name}.so"
+            path = self.folder / f"{source}-{name}.so"
             defined = [f"-D{name}={value}" for name, value in macros.items()]
             header = str(EMULATION / "emulation.h")
             text = ("-x", "c++", "-include", header, str(self.source(source)))
@@ -106,7 +106,7 @@ class EmulatedDevice:
 
     def _part(self, source: Path) -> str:
         """A source of the emulation itself, compiled once."""
-        path = self._folder / f"{source.stem}.o"
+        path = self.folder / f"{source.stem}.o"
         if not path.exists():
             self._build(path, "-c", str(source))
         return str(path)

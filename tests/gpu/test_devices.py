@@ -1,0 +1,114 @@
+"""Whole commands on a pretended GPU: no call mixes devices, and the results are the CPU's."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from finetune import tiny
+
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.testing.host import MINIATURE
+from fragprune_plugins.workbench.models.formats.ply import write_ply
+
+pytestmark = pytest.mark.skipif(
+    shutil.which("g++") is None or torch.version.cuda or not hasattr(torch, "accelerator"),
+    reason="needs g++, and a torch of 2.6 or later without CUDA",
+)
+
+
+CPU = """
+import sys
+from fragprune_plugins.workbench.commands import main
+sys.argv[:2] = ["fragprune"]
+main()
+"""
+
+
+@pytest.fixture
+def python(device):
+    """Runs a program that has imported the pretended GPU; its words follow."""
+
+    def run(text: str, *words: object, where: Path) -> str:
+        program = ["-c", f"from gpu import pretended\n{text}", str(device.folder)]
+        command = [sys.executable, *program, *map(str, words)]
+        paths = {"PYTHONPATH": os.pathsep.join(sys.path)}
+        done = subprocess.run(
+            command, cwd=where, env=os.environ | paths, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr[-3000:]
+        return done.stdout
+
+    return run
+
+
+MIXES = """
+import torch
+
+def expect_refused(call):
+    try:
+        call()
+    except RuntimeError as error:
+        assert "is on the CPU" in str(error) or "on the GPU changes" in str(error), error
+    else:
+        raise SystemExit("nothing was refused")
+
+class Careless(torch.autograd.Function):
+    forward = staticmethod(lambda ctx, x: x.clone())
+    backward = staticmethod(lambda ctx, grad: grad * torch.ones(3))
+
+with pretended.a_gpu():
+    there, here = torch.ones(3, device="cuda", requires_grad=True), torch.ones(3)
+    for call in (
+        lambda: there + here,
+        lambda: here[there > 0],
+        lambda: torch.cat([there, here]),
+        lambda: here.add_(there.detach()),
+        lambda: Careless.apply(there).sum().backward(),
+    ):
+        expect_refused(call)
+    there.square().sum().backward()
+    assert there.grad.is_cuda and there.cpu().tolist() == [1, 1, 1]
+"""
+
+
+def test_what_mixes_devices_is_refused_as_on_a_gpu(python, tmp_path):
+    python(MIXES, where=tmp_path)
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """A scene of COLMAP's, with points to begin from, and a model beside it."""
+    truth = tiny.random_model()
+    scene = tiny.write_colmap(tmp_path / "scene", tiny.photographs(truth))
+    points = [f"{i} {x} {y} {z} 99 99 99 1" for i, (x, y, z) in enumerate(truth.xyz.tolist(), 1)]
+    (scene / "sparse" / "0" / "points3D.txt").write_text("\n".join(points) + "\n")
+    write_ply(tmp_path / "model.ply", tiny.perturbed(truth))
+    return scene
+
+
+def test_a_model_learns_there_as_on_the_cpu(python, scene, tmp_path):
+    words = ["model.ply", "--data", scene, "--iters", 10, "--dropout", 0.2, "--json"]
+    found = {}
+    for kind in ("cuda", "cpu"):
+        more = ["finetune", *words, "--device", kind, "--out", f"{kind}.ply"]
+        text = "pretended.main()" if kind == "cuda" else CPU
+        found[kind] = json.loads(python(text, *more, where=tmp_path))["after"]
+    assert (found["cuda"]["engine"], found["cpu"]["engine"]) == ("cuda", "cpu")
+    for figure in ("psnr", "fragments_per_pixel", "ssim"):
+        assert found["cuda"][figure] == pytest.approx(found["cpu"][figure], rel=1e-3)
+
+
+def test_a_host_trains_and_is_pruned_there(python, scene, tmp_path):
+    host, out = shutil.copytree(MINIATURE, tmp_path / "host"), tmp_path / "out"
+    ours = ["--device", "cuda", "--iters", 20, "--json", "--", host / "train.py"]
+    theirs = ["-s", scene, "-m", out, "--iterations", 20, "--eval"]
+    result = json.loads(python("pretended.main()", "run", *ours, *theirs, where=tmp_path))
+    assert (result["engine"], result["device"]) == ("cuda", "cuda")
+    (model,) = out.glob("point_cloud/*/*.safetensors")
+    learned = sidecar.load(model.with_name("point_cloud.ply"))[0]
+    assert (learned.steps, learned.neutral, len(learned)) == (20, False, result["gaussians"])
