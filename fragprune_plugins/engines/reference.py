@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
 
 from fragprune_plugins.engines.calling import with_joined_sh
 from fragprune_plugins.types import Footprints, RasterInputs, RasterOutputs, Splats
 from reference_renderer import Camera, Gaussians, Options, Rendering, render, render_footprints
 from reference_renderer import Footprints as Projected
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 class ReferenceEngine:
@@ -22,7 +21,9 @@ class ReferenceEngine:
     def rasterize(self, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
         """Draw the splats; thresholds is (N,) falloff in (0, 1), or None for no truncation."""
         inputs.check_thresholds(thresholds)
-        drawn, pixels = _draw(inputs, thresholds), inputs.view.width * inputs.view.height
+        kind, pixels = inputs.splats.device.type, inputs.view.width * inputs.view.height
+        with torch.autocast("cuda" if kind == "cuda" else "cpu", enabled=False):
+            drawn = _draw(inputs, thresholds)  # compiled engines know no autocast either
         return RasterOutputs(
             image=drawn.image,
             radii=drawn.radii,

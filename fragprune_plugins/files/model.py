@@ -130,11 +130,10 @@ class Model:
 
         Thresholds keep their moments.
         """
+        store = self.with_rules().thresholds  # a copy, which refuses what is no mask
+        store.keep(mask)  # type: ignore[union-attr]
         kept: dict[str, Any] = {name: rows[mask] for name, rows in self.tensors.items()}
-        if self.thresholds is not None:
-            kept["thresholds"] = self.thresholds.clone()
-            kept["thresholds"].keep(mask)
-        return replace(self, **kept)
+        return replace(self, **kept, thresholds=None if self.thresholds is None else store)
 
     def splats(self, sh_apart: bool = False) -> Splats:
         """The Gaussians after activation, for engines; differentiable.

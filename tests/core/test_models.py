@@ -8,7 +8,7 @@ from cli.commands import run_json
 from finetune import tiny
 
 import fragprune_plugins as fp
-from fragprune_plugins.errors import DivergedError, OutputError
+from fragprune_plugins.errors import AlignmentError, DivergedError, OutputError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.workbench.models import formats
 from fragprune_plugins.workbench.models.formats.ply import write_ply
@@ -45,6 +45,15 @@ def test_the_file_is_the_one_that_the_command_line_writes(tmp_path):
     run_json("finetune", path, "--data", data, "--out", out, "--iters", 3)
     fp.save(again, fp.finetune(path, fp.load_dataset(data), fp.Settings(3)))
     assert again.read_bytes() == out.read_bytes()
+
+
+@pytest.mark.parametrize("cut", [True, False])
+def test_rows_are_kept_by_a_bool_mask_alone(model, cut):
+    """Whole numbers of 0 and 1 would give rows 0 and 1, over and over."""
+    model = model if cut else model.untruncated()
+    for mask in (torch.ones(60).long(), torch.ones(60).byte(), torch.ones(5).bool()):
+        with pytest.raises(AlignmentError, match=r"expected (60|a bool mask)"):
+            model.keep(mask)
 
 
 def test_what_cannot_be_saved_leaves_nothing(model, tmp_path):

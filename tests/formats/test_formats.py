@@ -20,7 +20,7 @@ from fragprune_plugins.errors import FragpruneError, ModelFileError, OutputError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.workbench.models import cutoffs, formats
-from fragprune_plugins.workbench.models.formats.arrays import morton_order, turned
+from fragprune_plugins.workbench.models.formats.arrays import morton_order, ordered, turned
 from fragprune_plugins.workbench.models.formats.ply import write_ply
 
 # Half a step of each format's own quantisation, with the values that ``random_splat`` has.
@@ -80,7 +80,7 @@ def through(suffix, model):
 def test_what_is_written_comes_back(suffix, splat):
     back = through(suffix, splat)
     if suffix in SORTED:
-        splat = splat.keep(morton_order(splat))
+        splat = ordered(splat, morton_order(splat))
     if suffix == ".splat":
         splat = replace(splat, f_rest=splat.f_rest[:, :0])
     found, bounds = apart(splat, back), BOUNDS[suffix]

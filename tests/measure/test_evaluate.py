@@ -1,6 +1,7 @@
 """Measuring splats on photographs, and the pictures of it."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -67,6 +68,16 @@ def test_nothing_to_measure_learn_or_judge_by_is_stated(truth, shots):
     for keep in (lambda: keep_best(truth, 0.5, []), lambda: keep_needed(truth, [])):
         with pytest.raises(InputError, match="no view to judge by"):
             keep()
+
+
+def test_what_is_no_data_set_or_settings_is_named(truth, shots):
+    for given in ("path", Path("path"), None, shots[0].view, [shots[0].view]):
+        with pytest.raises(InputError, match="expected a data set"):
+            measure(truth, given)
+    with pytest.raises(InputError, match="finetune dataset: 'path'; expected a Dataset"):
+        finetune(truth, "path")
+    with pytest.raises(InputError, match="finetune settings: 3; expected a Settings"):
+        finetune(truth, Dataset(shots, shots), 3)
 
 
 class Smaller:

@@ -60,11 +60,30 @@ def test_the_field_of_view_is_that_of_the_height():
         {"eye": (0, 0)},
         {"fov_y": 180},
         {"width": 0},
+        {"height": 0},
+        {"fov_y": 0},
+        {"up": (0, 1)},
     ],
 )
 def test_a_camera_that_sees_nothing_is_refused(changes):
     with pytest.raises(InputError):
         fp.look_at(**({"eye": (0, 0, 0), "target": (0, 0, 1), "width": 8} | changes))
+    if not changes.keys() & {"eye", "target"} and changes != {"up": (0, 0, 2)}:
+        with pytest.raises(InputError):
+            fp.overview(tiny.random_model(), **changes)
+
+
+def test_an_autocast_around_them_changes_neither_cameras_nor_pictures():
+    model = tiny.random_model()
+
+    def drawn():
+        view = fp.overview(model, width=32, height=24)
+        picture = fp.rasterize(fp.RasterInputs(view, model.splats()), engine="reference").image
+        return view.viewmatrix, view.projmatrix, view.campos, picture
+
+    plain = drawn()
+    with torch.autocast("cpu"):
+        assert all(map(torch.equal, drawn(), plain))
 
 
 @pytest.mark.parametrize("up", [(0, -1, 0), (0, 0, 1), (0, 0, -3), (1, 1, 0)])

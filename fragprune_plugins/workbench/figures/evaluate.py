@@ -112,6 +112,10 @@ def measure(
         InputError: pictures smaller than 11x11 pixels, or no view.
     """
     shots = dataset.test if isinstance(dataset, Dataset) else dataset
+    shots = list(shots) if isinstance(shots, Iterable) else [shots]
+    if wrong := [type(each).__name__ for each in shots if not isinstance(each, Shot)]:
+        expected, remedy = "a data set or its photographs", "Pass load_dataset(FOLDER)."
+        raise InputError("measure", f"{wrong[0]} in {type(dataset).__name__}", expected, remedy)
     return measure_all([Candidate(models.of(model))], shots, engine=engine, repeats=repeats)[0]
 
 

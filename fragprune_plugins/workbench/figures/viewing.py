@@ -16,7 +16,7 @@ from fragprune_plugins.errors import InputError
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins.hooks import engine_for, thresholds_for
-from fragprune_plugins.types import RasterInputs, RasterOutputs, View
+from fragprune_plugins.types import RasterInputs, RasterOutputs, View, check_tensor
 from fragprune_plugins.workbench.figures.pictures import picture
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.scenes.generated import bounds, not_too_near
@@ -52,12 +52,14 @@ def overview(
         InputError: there is no such view.
     """
     centre, radius = bounds(models.of(model))
-    half = math.atan(math.tan(math.radians(fov_y) / 2) * min(1.0, width / height))
-    above = torch.nn.functional.normalize(torch.tensor(up, dtype=torch.float32), dim=0)
+    above = torch.nn.functional.normalize(torch.as_tensor(up, dtype=torch.float32), dim=0)
+    check_tensor("overview up", above, 3)
     # As COLMAP's first camera looks: along z, or along y where z is up.
-    ahead = torch.eye(3)[2 if abs(float(above[2])) < 0.9 else 1]
-    ahead = torch.nn.functional.normalize(ahead - above * (ahead @ above), dim=0)
+    ahead = torch.eye(3).to(above)[2 if abs(float(above[2])) < 0.9 else 1]
+    ahead = torch.nn.functional.normalize(ahead - above * (ahead * above).sum(), dim=0)
     away = torch.nn.functional.normalize(0.4 * above - ahead, dim=0)
+    look_at(away, (0, 0, 0), up, width=width, height=height, fov_y=fov_y)  # refuses what is none
+    half = math.atan(math.tan(math.radians(fov_y) / 2) * min(1.0, width / height))
     distance, fov_y = not_too_near(radius / math.sin(half), radius, fov_y)
     eye = centre + distance * away
     return look_at(eye, centre, up, width=width, height=height, fov_y=fov_y)

@@ -69,11 +69,10 @@ def finetune(
         DivergedError: NaN or infinity in what trains.
     """
     ranks, model = ranks or Ranks(), models.of(model)
-    settings, device = settings or Settings(), model.device
+    settings, device = Settings() if settings is None else settings, model.device
     engine = engine_for(engine, device)
+    _expect_kinds(dataset, settings)
     dataset = dataset.to(device)
-    if not dataset.train:
-        raise InputError("dataset", "no training view", "at least one", "Pass photographs.")
     goal = settings.goal
     if isinstance(goal, AtMost):
         train = partial(finetune, model, dataset, engine=engine, progress=progress, ranks=ranks)
@@ -91,6 +90,16 @@ def finetune(
     schedule = schedule or schedule_for(settings)
     training = Training(model, dataset, settings, schedule, engine, processes, checkpoints)
     return _learned(training, progress and ranks.first)
+
+
+def _expect_kinds(dataset: Dataset, settings: Settings) -> None:
+    """Raise InputError unless it is a data set to learn from, and settings."""
+    for name, given, kind in (("dataset", dataset, Dataset), ("settings", settings, Settings)):
+        if not isinstance(given, kind):
+            remedy = "Pass load_dataset(FOLDER), and Settings(ITERATIONS)."
+            raise InputError(f"finetune {name}", repr(given)[:80], f"a {kind.__name__}", remedy)
+    if not dataset.train:
+        raise InputError("dataset", "no training view", "at least one", "Pass photographs.")
 
 
 def _learned(training: Training, progress: bool) -> FinetuneResult:

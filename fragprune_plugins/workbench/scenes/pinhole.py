@@ -134,12 +134,13 @@ def look_at(
     right = torch.nn.functional.normalize(right, dim=0)
     rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
     length = focal(height, math.radians(fov_y))
-    return View.pinhole(
-        rotation.float(),
-        (-rotation @ at).float(),
-        width=width,
-        height=height,
-        fx=length,
-        fy=length,
-        background=background,
-    )
+    with torch.autocast("cpu", enabled=False):  # it would turn the camera, by its three digits
+        return View.pinhole(
+            rotation.float(),
+            (-rotation @ at).float(),
+            width=width,
+            height=height,
+            fx=length,
+            fy=length,
+            background=background,
+        )

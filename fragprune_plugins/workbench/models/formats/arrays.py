@@ -141,6 +141,12 @@ def byte(values: npt.NDArray[Any]) -> Bytes:
     return np.clip(np.floor(values + 0.5), 0, 255).astype(np.uint8)
 
 
+def ordered(splat: Model, rows: Tensor) -> Model:
+    """The Gaussians of these rows, in this order, of a model without thresholds."""
+    taken: dict[str, Any] = {name: each[rows] for name, each in splat.tensors.items()}
+    return replace(splat, **taken)
+
+
 def morton_order(splat: Model) -> Tensor:
     """(N,) rows along a Z-order curve: near ones in space are near in the file."""
     return torch.from_numpy(z_order(array(splat.xyz)))

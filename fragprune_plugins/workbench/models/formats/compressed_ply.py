@@ -81,7 +81,7 @@ def read(reading: Reading) -> Model:
 
 def write(file: BinaryIO, splat: Model) -> None:
     """Write the Gaussians along a Z-order curve; the registry has refused thresholds."""
-    splat = splat.keep(arrays.morton_order(splat))
+    splat = arrays.ordered(splat, arrays.morton_order(splat))
     count, starts = len(splat), np.arange(0, len(splat), _CHUNK)
     of = np.arange(count) // _CHUNK
     ranges: dict[str, npt.NDArray[Any]] = {}

@@ -162,7 +162,7 @@ def _rotations(texels: arrays.Bytes) -> npt.NDArray[Any]:
 def write(file: BinaryIO, splat: Model) -> None:
     """Write a bundle along a Z-order curve; the extra image is there only if it cuts something."""
     order, codes, extra = arrays.morton_order(splat), arrays.codes_of(splat), arrays.rules_of(splat)
-    splat = splat.untruncated().keep(order)
+    splat = arrays.ordered(splat.untruncated(), order)
     count = len(splat)
     width = 4 * math.ceil(count**0.5 / 4)
     height = 4 * math.ceil(count / width / 4)
