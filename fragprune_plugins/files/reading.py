@@ -24,7 +24,6 @@ NESTING = 64
 """Most levels of a JSON value; what we read has six at most."""
 
 _SAID = 200  # characters of a parser's own words
-_POINTER = b"version https://git-lfs.github.com/"  # begins what git leaves in a large file's place
 
 
 class _Bounded(io.BufferedReader):
@@ -119,7 +118,7 @@ class UntrustedFile:
             if reading.size > self.limit:
                 found = f"{reading.size} bytes, more than such a file has"
                 raise self.error(str(path), found, f"at most {self.limit} bytes", self.remedy)
-            if file.peek().startswith(_POINTER):
+            if file.peek().startswith(b"version https://git-lfs.github.com/"):
                 raise self.error(str(path), "git's pointer", self.expected, "Run: git lfs pull")
             yield reading
 
@@ -170,10 +169,9 @@ class UntrustedFile:
 
 def lies_in(path: Path, folder: Path) -> bool:
     """Whether a path is in a folder once all links of both are followed."""
-    try:
+    with contextlib.suppress(OSError, ValueError):  # a NUL in the name
         return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
-    except (OSError, ValueError):  # a NUL in the name
-        return False
+    return False
 
 
 def parse_json(text: str) -> Any:
@@ -206,5 +204,4 @@ def message_of(error: BaseException) -> str:
     if isinstance(error, KeyError) and error.args:
         return f"no {error.args[0]!r}"[:_SAID]
     text = " ".join(str(error)[: 4 * _SAID].split())
-    text = text if len(text) <= _SAID else text[:_SAID] + "..."
-    return text or type(error).__name__
+    return (text if len(text) <= _SAID else text[:_SAID] + "...") or type(error).__name__

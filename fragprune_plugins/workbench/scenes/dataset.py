@@ -6,7 +6,7 @@ import logging
 import os
 import weakref
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
@@ -322,13 +322,7 @@ def load_dataset(
             "output folder, with cfg_args, or finetune made them",
             *(printable(str(folder)), off),
         )
-    if lying := [row.image for part in rows for row in part if turned(row.image)]:
-        log.warning(
-            "%s: %d photographs have an EXIF orientation, such as %s. Their pixels are read as "
-            "they are stored, as COLMAP and hosts read them. If the program that found the cameras "
-            "turned them, turn their pixels, too (exiftran -ai)",
-            *(printable(str(folder)), len(lying), printable(str(lying[0]))),
-        )
+    _warn_of_turned(row.image for part in rows for row in part)
     if dataset.leaked:
         log.warning(
             "%s: %d of the %d held-out views are training views too, so figures on them flatter: "
@@ -336,6 +330,16 @@ def load_dataset(
             *(printable(str(folder)), dataset.leaked, len(test)),
         )
     return dataset
+
+
+def _warn_of_turned(images: Iterable[Path]) -> None:
+    if lying := [image for image in images if turned(image)]:
+        log.warning(
+            "%s, and %d other photographs, have an EXIF orientation. Their pixels are read as they "
+            "are stored, as COLMAP and hosts read them. If the program that found the cameras "
+            "turned them, turn their pixels, too (exiftran -ai)",
+            *(printable(str(lying[0])), len(lying) - 1),
+        )
 
 
 def read_scene(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]]:
