@@ -50,29 +50,30 @@ def alignment(case: Case) -> None:
     )
     @given(sequences)
     def follow_any(sequence: list[tuple[str, Chance]]) -> None:
-        _follow(case, sequence)
+        with joint(**case.options()) as host:  # of its own: it may end in the midst of an action
+            _follow(host, sequence)
 
     follow_any()
-    for name in names:  # each at least once, first and alone
-        for seed in (1, 2):
-            _follow(case, [(name, Chance(seed, 0.4))])
+    with joint(**case.options()) as host:
+        for name in names:  # each at least once, first and alone
+            for seed in (1, 2):
+                _follow(host, [(name, Chance(seed, 0.4))])
     _rows_behind_the_store(case)
 
 
-def _follow(case: Case, sequence: list[tuple[str, Chance]]) -> None:
-    with joint(**case.options()) as host:
-        model, camera = host.model(COUNT), host.camera(16, 12)
-        host.step(model, camera, 1)  # so that the host's optimizer has moments to move
-        label(host, model)
-        actions = host.driver.actions()
-        for name, chance in sequence:
-            chance = replace(chance)  # a fresh generator, also when Hypothesis tries again
-            torch.manual_seed(chance.seed)  # hosts draw parents from the global stream
-            actions[name](model, host.arguments, chance)
-            expect_ancestors(host, model)
-            if not 0 < len(host.adapter.means(model)) < MOST:
-                return
-        require(host.render(camera, model)["render"].isfinite().all(), "pixels not finite")
+def _follow(host: Running, sequence: list[tuple[str, Chance]]) -> None:
+    model, camera = host.model(COUNT), host.camera(16, 12)
+    host.step(model, camera, 1)  # so that the host's optimizer has moments to move
+    label(host, model)
+    actions = host.driver.actions()
+    for name, chance in sequence:
+        chance = replace(chance)  # a fresh generator, also when Hypothesis tries again
+        torch.manual_seed(chance.seed)  # hosts draw parents from the global stream
+        actions[name](model, host.arguments, chance)
+        expect_ancestors(host, model)
+        if not 0 < len(host.adapter.means(model)) < MOST:
+            return
+    require(host.render(camera, model)["render"].isfinite().all(), "pixels not finite")
 
 
 def _rows_behind_the_store(case: Case) -> None:
