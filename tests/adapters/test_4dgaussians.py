@@ -12,6 +12,7 @@ import pytest
 import torch
 from miniatures import runs
 from miniatures.moving import MovingHost
+from miniatures.runs import FINETUNE, OFF, OPTIONS
 
 from fragprune_4dgaussians import MovingGaussians, PythonFile
 from fragprune_plugins.errors import HostFailed, ModelFileError, UsageError
@@ -22,7 +23,6 @@ from fragprune_plugins.testing.host import joint, running
 from fragprune_plugins.workbench.models import model as models
 
 LAST = 20
-OPTIONS = runs.OPTIONS
 EVERYTHING = replace(OPTIONS, settings=Settings(iterations=8, threshold_lr=0.3))
 
 
@@ -34,7 +34,7 @@ def trained(mini, photographs, tmp_path_factory):
     """An output folder after the host's own training."""
     out = tmp_path_factory.mktemp("trained") / "out"
     words = command(mini, photographs, out, "--checkpoint_iterations", 6, LAST)
-    run(words, replace(OPTIONS, stage="off"))
+    run(words, OFF)
     return out
 
 
@@ -83,8 +83,7 @@ def test_one_run_learns_after_an_iteration_of_the_fine_phase_alone(mini, photogr
     """The coarse phase reaches that iteration first, and must train on as if nothing were."""
     more = ("--coarse_iterations", 14, "--checkpoint_iterations", 9, 14, 16, LAST)
     summary = run(
-        command(mini, photographs, tmp_path / "out", *more),
-        replace(OPTIONS, stage="finetune", from_iter=9),
+        command(mini, photographs, tmp_path / "out", *more), replace(FINETUNE, from_iter=9)
     )
     assert summary.steps == LAST - 9 - 1
     assert "network" in summary.not_compared.found  # whatever else is missing
@@ -110,7 +109,7 @@ def test_a_stage_2_that_would_freeze_the_coarse_phase_is_refused(mini, photograp
 def test_a_newer_checkpoint_of_the_first_phase_is_no_start(mini, photographs, output):
     coarse = output / "chkpnt_coarse_6.pth"
     os.utime(coarse)
-    summary = run(command(mini, photographs, output), replace(OPTIONS, stage="finetune"))
+    summary = run(command(mini, photographs, output), FINETUNE)
     assert summary.model_after.parent.name == f"iteration_{LAST + 9}"
 
 
@@ -135,7 +134,7 @@ def test_a_folder_that_is_named_as_a_phase_is_refused_before_training(mini, phot
 def test_stage_2_starts_from_a_ply_and_the_network_beside_it(mini, photographs, output):
     for checkpoint in output.glob("*.pth"):
         checkpoint.unlink()
-    summary = run(command(mini, photographs, output), replace(OPTIONS, stage="finetune"))
+    summary = run(command(mini, photographs, output), FINETUNE)
     before, after = summary.model_before, summary.model_after
     assert runs.frozen_differences(before, after) == []
     assert same(network(before), network(after))
@@ -147,7 +146,7 @@ def test_a_ply_without_its_network_is_no_start(mini, photographs, output):
     for file in [*output.glob("*.pth"), *output.rglob("deformation.pth")]:
         file.unlink()
     with pytest.raises(ModelFileError, match=r"deformation\.pth"):
-        run(command(mini, photographs, output), replace(OPTIONS, stage="finetune"))
+        run(command(mini, photographs, output), FINETUNE)
 
 
 def test_the_folder_that_expname_means_is_found(mini, photographs, trained, tmp_path, monkeypatch):
@@ -155,14 +154,14 @@ def test_the_folder_that_expname_means_is_found(mini, photographs, trained, tmp_
     shutil.copytree(trained, tmp_path / "output" / "a" / "b")
     words = command(mini, photographs, "x", "--expname", "a/b")
     place = words.index("-m")
-    summary = run(words[:place] + words[place + 2 :], replace(OPTIONS, stage="finetune"))
+    summary = run(words[:place] + words[place + 2 :], FINETUNE)
     assert summary.model_after.resolve().is_relative_to(tmp_path / "output" / "a" / "b")
 
 
 def test_a_host_that_starts_itself_again_fails(mini, photographs, tmp_path):
     words = command(mini, photographs, tmp_path / "out", "--nan_at", 3)
     with pytest.raises(HostFailed, match="start itself again"):
-        run(words, replace(OPTIONS, stage="off"))
+        run(words, OFF)
 
 
 class Config(dict):

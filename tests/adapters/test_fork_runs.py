@@ -6,7 +6,7 @@ import pytest
 import torch
 from miniatures import runs
 from miniatures.changed import ForkHost
-from miniatures.runs import OPTIONS, check_stage_two, edit, frozen_differences
+from miniatures.runs import FINETUNE, OPTIONS, check_stage_two, edit, frozen_differences
 
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection.launch import run
@@ -45,7 +45,7 @@ def test_a_fork_without_checkpoints_is_pruned_in_one_run(fork, photographs, tmp_
     first = summary.model_before.parent.with_name("iteration_13") / "point_cloud.ply"
     check_stage_two(replace(summary, model_before=first), "3dgs-fork")
     assert [each["step"] for each in summary.curves] == list(range(1, 9))
-    control = replace(OPTIONS, stage="finetune", settings=replace(OPTIONS.settings, goal=Control()))
+    control = replace(FINETUNE, settings=replace(OPTIONS.settings, goal=Control()))
     again = run(words, control)  # it cannot resume either
     assert again.model_after.is_relative_to(tmp_path / "out/control")
     assert again.steps == 8

@@ -12,7 +12,7 @@ import pytest
 import torch
 from miniatures import runs
 from miniatures.light_gaussian import LightGaussianHost
-from miniatures.runs import OPTIONS, check_stage_two, frozen_differences, miniature
+from miniatures.runs import FINETUNE, OPTIONS, check_stage_two, frozen_differences, miniature
 from miniatures.vanilla_3dgs import expect_ancestors, joint, label, running
 from oracle import naive
 
@@ -21,7 +21,7 @@ from fragprune_plugins import Control
 from fragprune_plugins.adapting import hookimpl, read_ply
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.hosts.adapter import optimizer_state
-from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.injection.launch import run
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.testing.invariants.case import FixedThresholds
 
@@ -162,7 +162,7 @@ def test_finetune_alone_resumes_the_checkpoint_of_pruning(mini, photographs, tra
     summary, out = trained
     words = command(mini, "prune_finetune.py", photographs, tmp_path, 40, "--sh_degree", 2)
     words += ["--prune_iterations", "30", "--start_checkpoint", str(out / "chkpnt29.pth")]
-    again = run(words, RunOptions(device="cpu", stage="finetune", settings=OPTIONS.settings))
+    again = run(words, FINETUNE)
     assert (again.gaussians, again.steps) == (summary.gaussians, 8)
     assert frozen_differences(summary.model_after, again.model_after) == []
 
@@ -188,10 +188,8 @@ def test_distillation_is_resumed_by_the_training_script(mini, photographs, train
     assert [read_ply(p).sh_degree for p in (summary.model_before, summary.model_after)] == [1, 1]
     assert summary.model_after.parent.name == "iteration_42"
     assert frozen_differences(summary.model_before, summary.model_after) == []
-    student, teacher = (
-        sidecar.load(summary.model_before)[0],
-        sidecar.load(trained[0].model_after)[0],
-    )
+    files = summary.model_before, trained[0].model_after
+    student, teacher = (sidecar.load(each)[0] for each in files)
     assert torch.equal(student.logits, teacher.logits)  # applied while distilling, not learned
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from miniatures import runs
 from miniatures.hosts import HOSTS
-from miniatures.runs import FROZEN, OPTIONS
+from miniatures.runs import FINETUNE, FROZEN, OFF, OPTIONS
 from plyfile import PlyData
 
 from fragprune_graphdeco import GraphdecoAdapter
@@ -65,7 +65,7 @@ def stage_one(photographs, tmp_path_factory):
     folder = tmp_path_factory.mktemp("host")
     script, out = runs.written(HOSTS["vanilla-3dgs"], folder) / "train.py", folder / "out"
     words = runs.command(script, photographs, out, 10, *ENDED, "--checkpoint_iterations", 10)
-    run(words, replace(OPTIONS, stage="off"))
+    run(words, OFF)
     return words, out
 
 
@@ -89,7 +89,7 @@ def test_stage_two_begins_with_what_is_kept(alone, host, script, more, photograp
     folder, look = runs.written(HOSTS[host], tmp_path / "host"), Looked()
     words = runs.command(folder / script, photographs, tmp_path / "out", 10, *ENDED, *more)
     if alone:
-        run(words, replace(OPTIONS, stage="off"))
+        run(words, OFF)
     written = {path: path.read_bytes() for path in tmp_path.rglob("out/**/*.p*")}
     summary = run(words, replace(OPTIONS, look=look, stage="finetune" if alone else "auto"))
     ((shown, _, drawing, _),) = look.seen
@@ -105,7 +105,7 @@ def test_stage_two_begins_with_what_is_kept(alone, host, script, more, photograp
 
 
 def test_a_stage_two_that_a_look_changed_is_finished_when_asked_again(trained):
-    options = replace(OPTIONS, stage="finetune", again=False, look=Looked())
+    options = replace(FINETUNE, again=False, look=Looked())
     assert run(trained, options).steps == 8
     again = replace(options, look=Looked())
     finished = run(trained, again)
@@ -139,14 +139,14 @@ def test_a_ply_is_resumed_where_rows_of_the_checkpoint_are_other_gaussians(train
     with torch.no_grad():
         capture[1][3] += capture[1].max()
     torch.save((capture, iteration), checkpoint)
-    summary = run(trained, replace(OPTIONS, stage="finetune", look=look))
+    summary = run(trained, replace(FINETUNE, look=look))
     before, after = (read_ply(p).xyz for p in (summary.model_before, summary.model_after))
     assert torch.equal(after, before[::2])
 
 
 def test_a_control_is_looked_at_as_its_training_is(trained):
     control = replace(OPTIONS.settings, goal=Control())
-    options = replace(OPTIONS, stage="finetune", settings=control, look=Looked())
+    options = replace(FINETUNE, settings=control, look=Looked())
     run(trained, options)
     assert [settings.goal for *_, settings in options.look.seen] == [control.goal]
 

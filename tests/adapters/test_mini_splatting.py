@@ -2,7 +2,6 @@
 
 import logging
 import sys
-from dataclasses import replace
 from importlib import import_module
 
 import numpy as np
@@ -10,7 +9,7 @@ import pytest
 import torch
 from miniatures import runs
 from miniatures.mini_splatting import MiniSplattingHost
-from miniatures.runs import OPTIONS, miniature
+from miniatures.runs import OFF, OPTIONS, miniature
 from miniatures.vanilla_3dgs import HOST, InterruptAt, joint, label, running
 
 from fragprune_mini_splatting import MiniSplatting
@@ -76,7 +75,7 @@ def command(mini, scene, out, iterations, *more):
 def test_the_metric_without_its_weights_is_said_once(mini, photographs, tmp_path, caplog):
     with caplog.at_level(logging.WARNING, logger="fragprune"):
         more = ["--test_iterations", 2, 3]
-        run(command(mini, photographs, tmp_path, 4, *more), replace(OPTIONS, stage="off"))
+        run(command(mini, photographs, tmp_path, 4, *more), OFF)
     said = [record for record in caplog.records if "lpipsPyTorch:lpips" in record.getMessage()]
     assert len(said) == 1
     assert "no way there" in said[0].getMessage()

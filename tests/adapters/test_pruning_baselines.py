@@ -10,7 +10,7 @@ import torch
 from miniatures import runs
 from miniatures.compact_3dgs import CompactHost
 from miniatures.lp_3dgs import LPHost
-from miniatures.runs import OPTIONS, check_stage_two, edit, miniature, written
+from miniatures.runs import FINETUNE, OFF, OPTIONS, check_stage_two, edit, miniature, written
 from miniatures.speedy_splat import SpeedyHost
 from miniatures.vanilla_3dgs import joint, running
 from plyfile import PlyData
@@ -42,10 +42,7 @@ def test_speedys_third_output_is_a_time_that_can_be_divided_by(speedy):
 def test_speedys_pruning_is_refused_and_never_gets_zeros(speedy, photographs, tmp_path):
     """Zeros for scores would prune every Gaussian."""
     with pytest.raises(EngineError, match="--prune_until_iter 0"):
-        run(
-            command(speedy, photographs, tmp_path, 12, "--prune_interval", 9),
-            replace(OPTIONS, stage="off"),
-        )
+        run(command(speedy, photographs, tmp_path, 12, "--prune_interval", 9), OFF)
 
 
 def test_stage_two_of_speedy_prunes_nothing(speedy, photographs, tmp_path):
@@ -58,16 +55,13 @@ def test_lp_prunes_by_the_weights_of_what_is_drawn(lp, photographs, tmp_path):
     """bw_score at iteration 12: 70 % stay; in stage 2, which passes it again, all do."""
     words = command(lp, photographs, tmp_path, 10, "--prune_method", "mini_splatting")
     with pytest.raises(HostFailed, match="ours_30000"):
-        run([*words, "--iterations", "14"], replace(OPTIONS, stage="off"))
+        run([*words, "--iterations", "14"], OFF)
     (pruned,) = tmp_path.glob("point_cloud/iteration_14/point_cloud.ply")
     again = tmp_path / "again"
     words[words.index("-m") + 1] = str(again)
     with pytest.raises(HostFailed, match="ours_30000"):
-        run(
-            [*words, "--iterations", "11", "--checkpoint_iterations", "11"],
-            replace(OPTIONS, stage="off"),
-        )
-    summary = run(words, replace(OPTIONS, stage="finetune"))
+        run([*words, "--iterations", "11", "--checkpoint_iterations", "11"], OFF)
+    summary = run(words, FINETUNE)
     check_stage_two(summary, "lp-3dgs")
     rows = len(read_ply(summary.model_before).xyz)
     assert len(read_ply(pruned).xyz) == rows - int(0.3 * (rows - 1)) - 1
@@ -87,7 +81,7 @@ def test_lps_weights_add_up_to_the_picture_of_white_gaussians(lp):
 def test_scores_that_no_engine_computes_are_refused(lp, photographs, tmp_path):
     words = command(lp, photographs, tmp_path, 14, "--prune_method", "rad_splat")
     with pytest.raises(EngineError, match="mw_score"):
-        run(words, replace(OPTIONS, stage="off"))
+        run(words, OFF)
 
 
 def test_the_model_with_a_mask_is_refused_before_stage_one(lp, photographs, tmp_path):
@@ -103,7 +97,7 @@ def test_compact_is_known_by_its_codebooks_and_hash_grid(tmp_path):
 
 
 def test_compact_learns_in_the_later_part_of_its_run(compact, photographs, tmp_path):
-    options = replace(OPTIONS, stage="finetune", from_iter=10)
+    options = replace(FINETUNE, from_iter=10)
     summary = run(command(compact, photographs, tmp_path, 16), options)
     store, info = sidecar.load(summary.model_after)
     assert (info.adapter, summary.steps) == ("compact-3dgs", 5)

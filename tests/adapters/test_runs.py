@@ -16,7 +16,7 @@ from cli.commands import run as command_line
 from finetune.several import ended
 from miniatures import runs
 from miniatures.hosts import HOSTS
-from miniatures.runs import OPTIONS, check_stage_two
+from miniatures.runs import FINETUNE, OFF, OPTIONS, check_stage_two
 from miniatures.vanilla_3dgs import HOST, InterruptAt, running
 
 from fragprune_plugins import Control, Fewer, Portable, Pressure, Settings
@@ -48,7 +48,7 @@ def test_learning_from_an_iteration_on_freezes_from_there(photographs, tmp_path)
 def stage_one(photographs, tmp_path_factory):
     """A finished stage 1 of ten iterations."""
     out = tmp_path_factory.mktemp("stage_one") / "out"
-    run(command(photographs, out, 10), replace(OPTIONS, stage="off"))
+    run(command(photographs, out, 10), OFF)
     return out
 
 
@@ -60,11 +60,10 @@ def trained(stage_one, tmp_path):
 
 @pytest.mark.usefixtures("ctrl_c")
 def test_ctrl_c_in_stage_two_keeps_what_was_learned_to_be_resumed(photographs, trained, plug):
-    finetune = replace(OPTIONS, stage="finetune")
     plugin = InterruptAt(4)
     plug(plugin)
     with pytest.raises(Interrupted) as caught:
-        run(command(photographs, trained, 10), finetune)
+        run(command(photographs, trained, 10), FINETUNE)
     (saved,) = trained.glob("point_cloud/*/*.safetensors")
     model = saved.with_name("point_cloud.ply")
     assert str(model) in caught.value.found
@@ -79,10 +78,10 @@ def test_ctrl_c_in_stage_two_keeps_what_was_learned_to_be_resumed(photographs, t
     learned = store.values.detach()
     assert f"--start_checkpoint {model}" in caught.value.remedy
     named = command(photographs, trained, 10, "--start_checkpoint", model)
-    resumed, _ = sidecar.load(run(named, finetune).model_after)
+    resumed, _ = sidecar.load(run(named, FINETUNE).model_after)
     assert resumed.steps == 4 + 8
     assert (resumed.values.detach() - learned).abs().max() < 0.5
-    anew = run(command(photographs, trained, 10), finetune)
+    anew = run(command(photographs, trained, 10), FINETUNE)
     assert sidecar.load(anew.model_after)[0].steps == 8
 
 
@@ -102,15 +101,14 @@ def test_sigterm_in_stage_two_saves_what_was_learned_and_exits_with_143(photogra
 
 def test_killed_while_saving_it_starts_from_stage_one(photographs, trained, tmp_path, monkeypatch):
     """The host has written its model, the sidecar is not there yet."""
-    finetune = replace(OPTIONS, stage="finetune")
     killed = Path(shutil.copytree(trained, tmp_path / "killed"))
 
     def die():
         monkeypatch.setattr(sidecar.atomic, "put", lambda *_: signal.raise_signal(signal.SIGKILL))
-        run(command(photographs, killed, 10), finetune)
+        run(command(photographs, killed, 10), FINETUNE)
 
     assert ended(die) == -signal.SIGKILL
-    models = [run(command(photographs, out, 10), finetune).model_after for out in (trained, killed)]
+    models = [run(command(photographs, out, 10), FINETUNE).model_after for out in (trained, killed)]
     assert models[0].read_bytes() == models[1].read_bytes()
     one, other = (sidecar.load(model)[0] for model in models)
     assert all(map(torch.equal, one.numbers.values(), other.numbers.values()))
@@ -145,7 +143,7 @@ def test_train_then_finetune_then_render(photographs, tmp_path):
     assert truncated != [p.read_bytes() for p in sorted(renders.iterdir())]
 
 
-PORTABLE = replace(OPTIONS, stage="finetune", settings=Settings(iterations=8, goal=Portable()))
+PORTABLE = replace(FINETUNE, settings=Settings(iterations=8, goal=Portable()))
 
 
 def test_a_portable_run_moves_shapes_and_leaves_thresholds_neutral(photographs, trained):

@@ -25,7 +25,7 @@ from fragprune_vanilla_3dgs import Vanilla3DGS
 command = partial(runs.command, HOST / "train.py")
 SETTINGS = Settings(iterations=6, threshold_lr=0.3, train="opacity")
 OPTIONS = RunOptions(device="cpu", settings=SETTINGS)
-FINETUNE = replace(OPTIONS, stage="finetune")
+FINETUNE, OFF = (replace(OPTIONS, stage=stage) for stage in ("finetune", "off"))
 CONTROL = replace(FINETUNE, settings=replace(SETTINGS, goal=Control()))
 
 
@@ -87,7 +87,7 @@ def test_what_a_control_wrote_is_no_starting_point_in_its_own_folder(photographs
 
 
 def test_training_again_for_less_in_one_folder_is_what_counts(photographs, out, started, caplog):
-    run(command(photographs, out, 7), replace(OPTIONS, stage="off"))
+    run(command(photographs, out, 7), OFF)
     assert f"iteration 7, {out / ply(7)}:" in started(out, 7)
     (warning,) = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
     assert str(out / "chkpnt10.pth") in warning
@@ -95,12 +95,12 @@ def test_training_again_for_less_in_one_folder_is_what_counts(photographs, out, 
 
 
 def test_training_again_as_long_leaves_an_old_checkpoint_behind(photographs, out, started):
-    run(command(photographs, out, 10), replace(OPTIONS, stage="off"))
+    run(command(photographs, out, 10), OFF)
     assert f"iteration 10, {out / ply(10)}:" in started(out, 10)
 
 
 def test_training_again_over_a_result_of_stage_two_makes_it_stage_ones(photographs, out, started):
-    run(command(photographs, out, 17), replace(OPTIONS, stage="off"))
+    run(command(photographs, out, 17), OFF)
     with pytest.raises(SidecarError, match="thresholds of another model"):
         started(out, 17)
     sidecar.path_beside(out / ply(17)).unlink()
@@ -109,7 +109,7 @@ def test_training_again_over_a_result_of_stage_two_makes_it_stage_ones(photograp
 
 def test_a_later_ply_goes_before_an_early_checkpoint(photographs, tmp_path, started):
     words = command(photographs, tmp_path, 10, "--checkpoint_iterations", 5)
-    run(words, replace(OPTIONS, stage="off"))
+    run(words, OFF)
     assert f"{tmp_path / ply(10)}:" in started(tmp_path, 10)
 
 
@@ -126,7 +126,7 @@ def test_what_the_command_names_is_taken_also_of_stage_two(out, started):
 
 def test_a_training_that_was_broken_off_is_ended_before_stage_two(photographs, out, started):
     words = ("--checkpoint_iterations", 5)
-    run(command(photographs, out, 10, *words), replace(OPTIONS, stage="off"))
+    run(command(photographs, out, 10, *words), OFF)
     named = ("--start_checkpoint", out / "chkpnt5.pth")
     line = started(out, 10, *named, options=OPTIONS)
     assert line.endswith(f"iteration 10, {out / 'chkpnt10.pth'}: the end of stage 1")
@@ -247,7 +247,7 @@ def test_a_checkpoint_that_we_made_comes_to_the_gpu_of_its_model():
 def test_the_model_of_before_lies_where_the_named_start_does(photographs, out, tmp_path, named):
     """The command's own folder holds no model of that iteration, or another training's."""
     other, new = tmp_path / "other", tmp_path / "new"
-    run(command(photographs, other, 10, "--lambda_dssim", 0.9), replace(OPTIONS, stage="off"))
+    run(command(photographs, other, 10, "--lambda_dssim", 0.9), OFF)
     for folder in (other, new):
         words = command(photographs, folder, 10, "--start_checkpoint", out / named)
         summary = run(words, FINETUNE)

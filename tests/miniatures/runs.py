@@ -1,5 +1,6 @@
 """Whole runs of a miniature's own scripts, and what must not have moved in them."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ TINY = [
 """Flags with which a run of a few dozen iterations densifies and prunes."""
 
 OPTIONS = RunOptions(device="cpu", settings=Settings(8, threshold_lr=0.3, train="opacity"))
+OFF, FINETUNE = (replace(OPTIONS, stage=stage) for stage in ("off", "finetune"))
 FROZEN = ("xyz", "f_dc", "f_rest", "scaling", "rotation")
 
 
