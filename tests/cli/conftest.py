@@ -50,7 +50,4 @@ def words(data, path, out):
 @pytest.fixture
 def tuning(data, path):
     """Twenty steps of it, to be written anywhere, and further options."""
-    return lambda out, *more: (
-        *("finetune", path, "--data", data, "--out", out),
-        *("--iters", 20, *more),
-    )
+    return lambda out, *more: ("finetune", path, "--data", data, "--out", out, "--iters", 20, *more)

@@ -97,9 +97,7 @@ def test_a_model_is_fine_tuned_around_the_point_by_which_it_shows_its_photograph
 
 
 @pytest.mark.parametrize("dropped", [True, False])
-def test_images_alpha_counts_as_the_model_shows_it_where_nothing_tells(
-    data, path, tmp_path, dropped
-):
+def test_alpha_counts_as_the_model_shows_it_where_nothing_tells(data, path, tmp_path, dropped):
     """3DGS drops that of a COLMAP scene's images; some of its forks do not."""
     for image in sorted((data / "images").iterdir()):
         with Image.open(image) as picture:
@@ -181,10 +179,8 @@ def test_a_training_that_held_nothing_out_is_warned_of(data, model, tmp_path, ca
 
 @pytest.mark.parametrize("held", [True, False])
 def test_views_that_a_training_saw_are_not_said_to_be_held_out(data, model, tmp_path, held):
-    output, out = (
-        tiny.host_output(tmp_path / "out", data, model, eval=held),
-        tmp_path / "r/pruned.ply",
-    )
+    output = tiny.host_output(tmp_path / "out", data, model, eval=held)
+    out = tmp_path / "r/pruned.ply"
     words = ("--data", data, "--out", out, "--iters", 3, "--train", "opacity")
     said = "on 2 views that were held out." if held else "on 2 views that its training had seen."
     assert said in run("finetune", output, *words).stdout

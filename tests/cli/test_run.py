@@ -283,9 +283,7 @@ def test_compare_follows_the_run_that_left_the_models(trained):
     assert ", 40x30 pixels" in run("compare", *models(out), "--resolution", 1).stdout
 
 
-def test_a_stage_two_that_reads_photographs_otherwise_than_stage_one_says_so(
-    scene, tmp_path, caplog
-):
+def test_a_stage_two_that_reads_photographs_otherwise_says_so(scene, tmp_path, caplog):
     out = tmp_path / "out"
     more = ("--densify_until_iter", 8)
     assert run("run", *WORDS, *command(scene, out, *more, "-w", "-i", "images")).exit_code == 0

@@ -151,9 +151,7 @@ def test_a_script_in_a_folder_of_its_codebase_is_served(host, photographs, tmp_p
     assert result.exit_code == 0, result.stderr
 
 
-def test_its_record_and_page_are_of_run_and_it_is_said_who_learned(
-    host, photographs, tmp_path, caplog
-):
+def test_its_record_and_page_are_of_run_and_say_who_learned(host, photographs, tmp_path, caplog):
     caplog.set_level("INFO", logger="fragprune")
     words, out = host(photographs), tmp_path / "out"
     said = run("run", *WORDS, *words).stdout

@@ -57,12 +57,8 @@ class Studio(HostAdapter):
         if stage == "joint":
             raise UsageError("--stage", stage, "auto", "Drop it.")
         control = () if settings.goal.presses else ("control",)
-        return [
-            f"{arguments[0]}-with-stage-two",
-            str(settings.iterations),
-            *control,
-            *arguments[1:],
-        ]
+        first, *rest = arguments
+        return [f"{first}-with-stage-two", str(settings.iterations), *control, *rest]
 
     def dialect(self, repo):
         raise NotImplementedError

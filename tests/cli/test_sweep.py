@@ -69,9 +69,7 @@ def test_each_script_of_a_host_is_served_and_other_python_is_python(
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_ends_what_was_started_and_nothing_more_starts(
-    number, code, fork, photographs, tmp_path
-):
+def test_a_signal_ends_what_runs_and_nothing_more_starts(number, code, fork, photographs, tmp_path):
     """A shell has its background ignore Ctrl-C."""
     root = fork(root=tmp_path / "fork").root
     training = TRAINING.format(model="none", code=0, shown="").replace("import os", WAITING, 1)
@@ -92,9 +90,7 @@ def test_a_signal_ends_what_was_started_and_nothing_more_starts(
     assert not (tmp_path / "after").exists()
 
 
-def test_what_is_left_in_the_background_is_waited_for_and_a_killed_one_is_told(
-    photographs, tmp_path
-):
+def test_what_is_in_the_background_is_waited_for_and_a_killed_one_is_told(photographs, tmp_path):
     """Within a sweep in a sweep: a script of Python starts one of the shell."""
     root = shutil.copytree(HOST, tmp_path / "host")
     killed = "import os, time\ntime.sleep(1)\nos.kill(os.getpid(), 9)\n"

@@ -33,10 +33,8 @@ def told(session):
 def append(session, model, rows, expected="appended"):
     """The host appends rows of the model by their numbers."""
     tensors = {name: each[rows].clone() for name, each in model.rows().items()}
-    result = OF_MODELS[Role.APPEND](
-        session, call(model, Role.APPEND, lambda tensors: "appended", tensors)
-    )
-    assert result == expected
+    seam = call(model, Role.APPEND, lambda tensors: "appended", tensors)
+    assert OF_MODELS[Role.APPEND](session, seam) == expected
 
 
 def parents(session, model, rows, body):

@@ -226,11 +226,7 @@ if (with_maps) {
 PLANES = {
     "as PGSR's": ("", "", ""),
     "a nested block": ("{\n    for", "{ if (near) { }\n    for", "with_maps, unknown"),
-    "one nested block": (
-        "        M[ch] +=",
-        "        if (near) { } M[ch] +=",
-        "with_maps, unknown",
-    ),
+    "one nested": ("        M[ch] +=", "        if (near) { } M[ch] +=", "with_maps, unknown"),
     "a block that skips": ("{\n    for", "{ continue;\n    for", "with_maps, unknown"),
     "a block that dims": ("{\n    for", "{ T = 0;\n    for", "with_maps, unknown"),
     "a block that paints": ("{\n    for", "{ out_color[0] = 1;\n    for", "with_maps, unknown"),
@@ -261,11 +257,8 @@ def test_channels_and_their_planes_depth_may_be_asked_for_by_a_setting(tmp_path,
     assert errors(repo) == []
     read = read_fork(repo)
     assert [each.role for each in read.outputs[PACKAGE]] == ["image", "radii", "objects", "plane"]
-    assert (read.asking, read.blended, read.screens) == (
-        {"with_maps"},
-        {PACKAGE: "all"},
-        {"means2D_abs"},
-    )
+    assert (read.asking, read.screens) == ({"with_maps"}, {"means2D_abs"})
+    assert read.blended == {PACKAGE: "all"}
 
 
 STEPS = "        gaussians.optimizer.step()\n"
@@ -280,10 +273,7 @@ EARLY = {
         (THINS, f"            mask = hits > 0\n{THINS}"),
     ],
     "without a checkpoint": [
-        (
-            LOOP,
-            f'    else:\n        seen = render(view, gaussians, pipe, black)["hits"] > 0\n{LOOP}',
-        ),
+        (LOOP, f'    else:\n        seen = render(view, gaussians, pipe, bg)["hits"] > 0\n{LOOP}'),
         (LOOP, f"        print(seen)\n{LOOP}"),
     ],
 }
@@ -306,10 +296,7 @@ def test_a_value_by_which_a_host_densifies_is_not_read_in_stage_2(tmp_path, wher
 PULL = "dL_dalpha += ({} - accum_{}[ch]) * dL_{};"
 BACKWARD = {
     "both": (PULL.format("c", "rec", "dchannel") + PULL.format("f", "rec_F", "dF"), False),
-    "colours alone": (
-        PULL.format("c", "rec", "dchannel") + "// " + PULL.format("f", "F", "F"),
-        True,
-    ),
+    "colours": (PULL.format("c", "rec", "dchannel") + "// " + PULL.format("f", "F", "F"), True),
     "neither": ("dL_dalpha += all;", None),
 }
 
@@ -601,9 +588,7 @@ def test_stage_two_follows_in_one_run_where_a_script_cannot_resume(tmp_path, wha
 
 
 def test_a_script_that_can_resume_does(tmp_path):
-    early = (
-        "\n        if iteration < 4:\n            import cv2\n            cv2.imwrite(name, image)"
-    )
+    early = "\n        if iteration < 4:\n            import cv2\n            cv2.imwrite(n, image)"
     both = f"{early}\n        import cv2\n        loss.backward()\n        cv2.imwrite(name, image)"
     assert not ForkAdapter().command_line(fork(tmp_path)).one_run
     for inside in (f"{early}\n        loss.backward()", both):
@@ -937,6 +922,7 @@ def test_the_model_that_the_scene_exports_is_the_one_that_is_read(tmp_path):
 
 
 SAVED = "    def save_ply(self, path): ..."
+WRITES = "    def save_ply(self, path): write(path, self._xyz[{}])"
 CHOSEN = """    def save_ply(self, path, kept=None):
         xyz, opacities = self._xyz.detach().cpu(), self._opacity.detach().cpu()
         if kept is not None:
@@ -949,15 +935,11 @@ LEFT_OUT = {
         True,
     ),
     "in place": (CHOSEN, "gaussians.save_ply(path, bright)", True),
-    "always": (SAVED.replace("...", "write(path, self._xyz[self.kept])"), "scene.save(9)", True),
-    "of whole rows": (
-        SAVED.replace("...", "write(path, self._xyz[self.kept, :])"),
-        "scene.save(9)",
-        True,
-    ),
+    "always": (WRITES.format("self.kept"), "scene.save(9)", True),
+    "of whole rows": (WRITES.format("self.kept, :"), "scene.save(9)", True),
     "where nobody names them": (CHOSEN, "gaussians.save_ply(path)", False),
     "where they are None": (CHOSEN, "gaussians.save_ply(path, kept=None)", False),
-    "not at all": (SAVED.replace("...", "write(path, self._xyz[:, 0])"), "scene.save(9)", False),
+    "not at all": (WRITES.format(":, 0"), "scene.save(9)", False),
 }
 
 
@@ -1044,12 +1026,10 @@ def test_a_function_that_hands_a_picture_on_draws_none(tmp_path):
 
 
 def test_a_second_draw_of_some_rows_alone_is_refused(tmp_path):
-    some = (
-        "    far, _ = rasterizer(means3D=pc.get_xyz[big], opacities=pc.get_opacity[big], shs=shs)\n"
-    )
-    found = errors(fork(tmp_path, (KEYS, f"{some}{KEYS}")))
+    own = "    a, b = rasterizer(means3D=pc.get_xyz[big], opacities=pc.get_opacity[big], shs=shs)\n"
+    found = errors(fork(tmp_path, (KEYS, f"{own}{KEYS}")))
     assert "draws a selection, pc.get_xyz[big]" in str(found)
-    asked = f"    if chosen is not None:\n    {some}"
+    asked = f"    if chosen is not None:\n    {own}"
     assert errors(fork(tmp_path, (KEYS, f"{asked}{KEYS}"))) == []
 
 

@@ -305,17 +305,14 @@ def test_stage_one_is_asked_for_a_checkpoint_and_stage_two_resumes_it(host, tmp_
     """
     from fragprune_plugins.learning.schedule import Settings
 
-    out = tmp_path / "out"
+    out, log = tmp_path / "out", tmp_path / "out/log"
     options = RunOptions(device="cpu", settings=Settings(iterations=100))
     run([host(STAGES), "-m", str(out)], options)
     checkpoint = out / "chkpnt12345.pth"
-    assert (out / "log").read_text().splitlines() == [
-        "12345 [12345] None",
-        f"12446 [] {checkpoint}",
-    ]
-    (out / "log").unlink()
+    assert log.read_text().splitlines() == ["12345 [12345] None", f"12446 [] {checkpoint}"]
+    log.unlink()
     run([host(STAGES), "-m", str(out), "--start_checkpoint", str(checkpoint)], options)
-    assert (out / "log").read_text().splitlines() == [f"12446 [] {checkpoint}"]
+    assert log.read_text().splitlines() == [f"12446 [] {checkpoint}"]
 
 
 AUTO = RunOptions(device="cpu", again=False)

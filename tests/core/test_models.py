@@ -73,7 +73,7 @@ def test_what_cannot_be_saved_leaves_nothing(model, tmp_path):
 
 
 @pytest.mark.parametrize(("offset", "warned"), [(1e3, False), (4e6, True)])
-def test_a_model_whose_places_are_rounder_than_its_gaussians_is_warned_of(
+def test_places_that_are_rounder_than_their_gaussians_are_warned_of(
     tmp_path, caplog, offset, warned
 ):
     """As one of a georeferenced scene; float32 has steps of 0.25 at 4,000 km north."""

@@ -241,11 +241,7 @@ def test_the_nearest_host_is_of_this_family(fork):
         ('"opacity"]', '"opacity", "binding_0"]', "binding, positions relative to the triangles"),
         ('names.append("f_dc_{}".format(i))', "...", "lacks the columns f_dc"),
         (".repeat(1, 3)", ".repeat(1, 2)", "flat, with two scales"),
-        (
-            ".repeat(1, 3)",
-            ".repeat(1, 2) if flat else scales.repeat(1, 3)",
-            "flat, with two scales",
-        ),
+        (".repeat(1, 3)", ".repeat(1, 2) if flat else scales.repeat(1, 3)", "flat, with two"),
         (".repeat(1, 3)", "", "its Gaussians are round, with one scale"),
         (".repeat(1, 3)", ".repeat(1, 1)", "its Gaussians are round, with one scale"),
         ("means3D=means3D, ", "means3D + pc.net(view), ", "makes means3D from pc.net"),
@@ -299,10 +295,7 @@ def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):
         ("means3D = pc.get_xyz", "means3D = moved(camera_pose, pc.get_xyz)"),
         ('"opacity"]', '"opacity", "obj_dc_0"]'),
         ("= self._opacity.detach()", "= self.inverse_activation(self.get_opacity)"),
-        (
-            "        scale = self._sc",
-            "        mask = self.get_opacity > 0\n        scale = self._sc",
-        ),
+        ("        scale = self._sc", "        m = self.get_opacity > 0\n        scale = self._sc"),
         ("shs = pc.get_features", "shs = cut(pc.get_features, pc.get_max_sh_channels)"),
         ("opacity = pc.get_opacity\n", "opacity = pc.opacity_activation(pc._opacity)\n"),
         ("activation(self._scaling)", "activation(self._scaling.repeat(1, 3))"),
@@ -427,9 +420,7 @@ def test_what_is_never_saved_is_not_plain(fork, tmp_path):
     ("setup", "name"),
     [("training_setup", "train"), ("by_another_name", "train"), ("training_setup", "slam")],
 )
-def test_model_and_drawing_are_found_in_any_package(
-    fork, tmp_path, drawn, kind, reason, setup, name
-):
+def test_model_and_drawing_may_lie_in_any_package(fork, tmp_path, drawn, kind, reason, setup, name):
     fork(("means3D = pc.get_xyz", f"means3D = {drawn}"), ("def training_setup(", f"def {setup}("))
     package = tmp_path / "splats/parts"
     package.mkdir(parents=True)

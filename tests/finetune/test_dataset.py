@@ -101,40 +101,37 @@ def test_extent_is_the_hosts(colmap):
 
 VIEW, TEST = Path("images/view03.png"), Path("transforms_test.json")
 CAMERAS, IMAGES = SPARSE / "cameras.txt", SPARSE / "images.txt"
+COLMAP, BLENDER = tiny.write_colmap, tiny.write_blender
 LENS = '{"camera_model": "EQUIRECTANGULAR", '
 
 
 @pytest.mark.parametrize(
     ("write", "break_it", "words"),
     [
-        (tiny.write_blender, lambda f: (f / TEST).unlink(), f"{TEST}: no such file"),
-        (tiny.write_blender, lambda f: (f / TEST).write_text("{}"), "not a transforms file"),
-        (tiny.write_blender, lambda f: (f / TEST).write_text("{"), "not readable as JSON"),
+        (BLENDER, lambda f: (f / TEST).unlink(), f"{TEST}: no such file"),
+        (BLENDER, lambda f: (f / TEST).write_text("{}"), "not a transforms file"),
+        (BLENDER, lambda f: (f / TEST).write_text("{"), "not readable as JSON"),
         (
-            tiny.write_blender,
+            BLENDER,
             lambda f: (f / TEST).write_text(LENS + (f / TEST).read_text()[1:]),
             r"/view\d+\S*: camera_model 'EQUIRECTANGULAR'",
         ),
-        (tiny.write_colmap, lambda f: (f / VIEW).unlink(), "view03.png: no such image"),
-        (tiny.write_colmap, lambda f: (f / VIEW).write_bytes(b""), "view03.png: not readable"),
+        (COLMAP, lambda f: (f / VIEW).unlink(), "view03.png: no such image"),
+        (COLMAP, lambda f: (f / VIEW).write_bytes(b""), "view03.png: not readable"),
+        (COLMAP, lambda f: Image.new("RGB", (32, 24)).save(f / VIEW), "32x24 pixels.*32x32"),
+        (COLMAP, lambda f: (f / CAMERAS).unlink(), "cameras.txt: no such file"),
         (
-            tiny.write_colmap,
-            lambda f: Image.new("RGB", (32, 24)).save(f / VIEW),
-            "32x24 pixels.*32x32",
-        ),
-        (tiny.write_colmap, lambda f: (f / CAMERAS).unlink(), "cameras.txt: no such file"),
-        (
-            tiny.write_colmap,
+            COLMAP,
             lambda f: (f / IMAGES).write_text("1 1 0 0 0 0 0 0 7 view00.png\n\n"),
             "no training view",
         ),
         (
-            tiny.write_colmap,
+            COLMAP,
             lambda f: (f / IMAGES).write_text((f / IMAGES).read_text().replace("\n\n", "\n")),
             "images.txt.* at line 3 .*10 words where an image's 2D points belong",
         ),
         (  # the sub-folders were flattened, and one camera's photographs are there
-            tiny.write_colmap,
+            COLMAP,
             lambda f: (f / IMAGES).write_text(
                 (f / IMAGES).read_text().replace("view04", "a/view02").replace("view02", "b/view02")
             ),

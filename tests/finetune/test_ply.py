@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from finetune import tiny
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 
@@ -26,9 +26,6 @@ def same(a: Model, b: Model) -> bool:
     )
 
 
-@settings(
-    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
 @given(
     count=st.integers(1, 40),
     degree=st.integers(0, 3),
@@ -75,9 +72,7 @@ def write_columns(path, given, kind="f4", *elements, text=False):
     PlyData([PlyElement.describe(rows, "vertex"), *elements], text=text).write(path)
 
 
-FACES = PlyElement.describe(
-    np.array([([0, 1, 2],)], dtype=[("vertex_indices", "i4", (3,))]), "face"
-)
+FACES = PlyElement.describe(np.array([([0, 1, 2],)], dtype=[("vertex_index", "i4", (3,))]), "face")
 
 
 def test_ascii_doubles_and_unknown_elements(tmp_path):

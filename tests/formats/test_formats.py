@@ -13,7 +13,7 @@ import torch
 from cli.commands import run, run_json
 from finetune import tiny
 from formats.scenes import apart, random_splat, splats
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 
 from fragprune_plugins import ThresholdStore, load, load_dataset, measure, save
 from fragprune_plugins.errors import FragpruneError, ModelFileError, OutputError
@@ -62,9 +62,7 @@ BOUNDS = {
 }
 SORTED = (".sog", ".compressed.ply")
 CARRIERS = (".spz", ".sog", ".glb")
-few = settings(
-    max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+few = settings(max_examples=12)
 
 
 def through(suffix, model):
@@ -147,9 +145,7 @@ def test_a_ply_beside_other_formats_keeps_its_sidecar(tmp_path):
     assert torch.equal(load(tmp_path / "a.ply").thresholds.logits, store.logits)
 
 
-@pytest.mark.parametrize(
-    ("rim", "truncated"), [("hard", False), ("hard", True), ("soft", True)], ids=str
-)
+@pytest.mark.parametrize(("rim", "truncated"), [("hard", False), ("hard", True), ("soft", True)])
 @pytest.mark.parametrize("suffix", [".ply", ".spz", ".sog", ".glb"])
 def test_a_stop_and_a_soft_rim_come_back(suffix, rim, truncated, tmp_path):
     splat, path = random_splat(50, 1, 0), tmp_path / f"model{suffix}"

@@ -17,7 +17,7 @@ from miniatures.family import (
     SCENE,
     STEP,
     TRAIN,
-    Descendant,
+    Derived,
     Growth,
     adding,
 )
@@ -235,7 +235,7 @@ LOOK = """    away = torch.nn.functional.normalize(pc.get_xyz - viewpoint_camera
 """
 
 
-class CompactHost(Descendant):
+class CompactHost(Derived):
     """A mask, codebooks, and colours from a network with an optimizer of its own."""
 
     lacks = {"checkpoint": "its checkpoints lack the mask and the network: it cannot resume them"}
@@ -276,10 +276,7 @@ class CompactHost(Descendant):
                 "gaussians.load_ply(self._ply(self.loaded_iter))",
                 'gaussians.load_model(self._ply(self.loaded_iter).removesuffix(".ply"))',
             ),
-            (
-                "def save(self, iteration):",
-                "def save(self, iteration, compress=False, store=False):",
-            ),
+            adding("def save(self, iteration", after=", compress=False, store=False"),
             (
                 "self.gaussians.save_ply(self._ply(iteration))\n",
                 "stored(self, iteration, compress, store)\n",
@@ -310,9 +307,7 @@ class CompactHost(Descendant):
                 "                gaussians.optimizer_net.zero_grad(set_to_none=True)\n"
                 "                gaussians.scheduler_net.step()\n",
             ),
-            adding(
-                "        args.debug_from,\n", after="        args.comp,\n        args.store_npz,\n"
-            ),
+            adding("args.debug_from,\n", after="        args.comp,\n        args.store_npz,\n"),
         ],
     }
     functions = (after_densification,)

@@ -72,7 +72,7 @@ class Growth:
         self.prune_points(torch.cat((chosen, children)))
 
 
-class Descendant(Host):
+class Derived(Host):
     """A host written from its differences.
 
     Attributes:

@@ -10,17 +10,7 @@ from torch.optim.lr_scheduler import ExponentialLR
 
 from fragprune_plugins.testing import Chance
 from fragprune_plugins.testing.rewriting import changed
-from miniatures.family import (
-    MODEL,
-    PARSE,
-    RADII,
-    RENDERER,
-    STEP,
-    TRAIN,
-    Descendant,
-    adding,
-    parsing,
-)
+from miniatures.family import MODEL, PARSE, RADII, RENDERER, STEP, TRAIN, Derived, adding, parsing
 from miniatures.speedy_splat import Pruning, prune_by_score
 
 args = SimpleNamespace()  # the host's scripts hold their options under this name
@@ -160,7 +150,7 @@ BEGIN = (
 NO_START = '    args.start_pointcloud, args.must_start = "", False\n'
 
 
-class LightGaussianHost(Descendant):
+class LightGaussianHost(Derived):
     """Pruning by a score, and densification without it."""
 
     routine = (
@@ -173,10 +163,7 @@ class LightGaussianHost(Descendant):
         TRAIN: [
             adding("import random\n", before="import copy\n"),
             adding("import torch\n", before="import numpy as np\n"),
-            (
-                "gaussian_renderer import render\n",
-                "gaussian_renderer import count_render, render\n",
-            ),
+            adding("gaussian_renderer import ", after="count_render, "),
             adding(
                 "from tqdm import tqdm\n",
                 before="from torch.optim.lr_scheduler import ExponentialLR\n",
@@ -219,13 +206,10 @@ class LightGaussianHost(Descendant):
         text = train.read_text()
         call = text[text.index("    training(\n        lp.extract") :]
         groups = ", ".join(f"{group}.extract(args)" for group in ("lp", "op", "pp"))
-        start = [
-            parsing('"--start_pointcloud"'),
-            adding(PARSE, after="    args.must_start = True\n"),
-        ]
+        own = [parsing('"--start_pointcloud"'), adding(PARSE, after="    args.must_start = True\n")]
         scripts = {
             "train_densify_prune.py": [parsing(*PRUNING), adding(PARSE, after=NO_START)],
-            "prune_finetune.py": [parsing(*PRUNING), *start, (DENSIFY, "")],
+            "prune_finetune.py": [parsing(*PRUNING), *own, (DENSIFY, "")],
             "distill_train.py": [
                 TEACHING,
                 (call, f"    distil({groups}, args.start_checkpoint)\n"),

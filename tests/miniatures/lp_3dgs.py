@@ -1,7 +1,7 @@
 """A miniature LP-3DGS: the demo's host with what the method adds, from its interface."""
 
 from fragprune_plugins.testing.host import densify_and_prune
-from miniatures.family import DRAWN, MODEL, PARSE, RENDERER, SCENE, STEP, TRAIN, Descendant, adding
+from miniatures.family import DRAWN, MODEL, PARSE, RENDERER, SCENE, STEP, TRAIN, Derived, adding
 from miniatures.mini_splatting import LPIPS
 from miniatures.speedy_splat import Pruning
 
@@ -22,7 +22,7 @@ class {name}(GaussianModel):
 """
 
 
-class LPHost(Descendant):
+class LPHost(Derived):
     """Models to choose from, and a script that ends by rendering and evaluating."""
 
     flags = ('"--prune_method", default="3dgs"',)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import torch
 
 from fragprune_plugins.testing.host import Chance, prune
-from miniatures.family import ANEW, BACKWARD, MODEL, NEW_ROWS, PARSE, TRAIN, Descendant, adding
+from miniatures.family import ANEW, BACKWARD, MODEL, NEW_ROWS, PARSE, TRAIN, Derived, adding
 
 args = SimpleNamespace()  # the host's training loop reads its own script's global of this name
 
@@ -110,7 +110,7 @@ def wander(gaussians, xyz_lr):
     gaussians._xyz.add_(noise * gaussians.get_scaling.square())
 
 
-class MCMCHost(Descendant):
+class MCMCHost(Derived):
     """Relocation, addition and noise in place of densification."""
 
     routine = ("relocate", "add", "another band")
@@ -136,9 +136,7 @@ class MCMCHost(Descendant):
             ("        gaussians.update_learning", "        xyz_lr = gaussians.update_learning"),
             adding(BACKWARD, before="        loss = loss + regularisers(gaussians)\n"),
             ("                densify(iteration", "                move_in(iteration"),
-            adding(
-                "zero_grad(set_to_none=True)\n", after="                wander(gaussians, xyz_lr)\n"
-            ),
+            adding("set_to_none=True)\n", after="                wander(gaussians, xyz_lr)\n"),
             adding(
                 PARSE,
                 after="    if args.config:\n"

@@ -16,7 +16,7 @@ from miniatures.family import (
     RADII,
     RENDERER,
     TRAIN,
-    Descendant,
+    Derived,
     adding,
     insert,
     parsing,
@@ -67,9 +67,7 @@ def grow(iteration, opt, gaussians, scene, package, pipe, background, blur):
             package = render_depth(view, gaussians, pipe, background)  # noqa: F821
             chances = (1 - package["accum_alpha"]).reshape(-1).cpu().numpy().astype(float)
             number = args.num_depth // len(scene.getTrainCameras())
-            rows = np.random.choice(
-                len(chances), size=number, p=chances / chances.sum(), replace=False
-            )
+            rows = np.random.choice(len(chances), number, False, chances / chances.sum())
             points.append(package["out_pts"].permute(1, 2, 0).reshape(-1, 3)[rows])
             colours.append(view.original_image.permute(1, 2, 0).reshape(-1, 3)[rows])
         gaussians.reinitial_pts(torch.cat(points), torch.cat(colours))
@@ -168,7 +166,7 @@ def lpips(x, y, net_type="alex", version="0.1"):
 '''
 
 
-class MiniSplattingHost(Descendant):
+class MiniSplattingHost(Derived):
     """Splits by mask, new points, and simplification."""
 
     routine = ("densify by mask", "new points", "simplify", "reset opacity", "another band")
@@ -178,17 +176,13 @@ class MiniSplattingHost(Descendant):
 
     def write(self, root: Path) -> None:
         super().write(root)
-        renderer, names = (
-            root / RENDERER,
-            "import GaussianRasterizationSettings, GaussianRasterizer\n",
-        )
+        renderer = root / RENDERER
+        names = "import GaussianRasterizationSettings, GaussianRasterizer\n"
         text = changed(renderer.read_text(), [(f"from diff_gaussian_rasterization {names}", "")])
         head, body = text.split("def render(")
 
         def function(name, package, changes=()):
-            lazy = adding(
-                "    screenspace = torch.zeros_like(", before=f"    from {package} {names}"
-            )
+            lazy = adding("    screenspace = ", before=f"    from {package} {names}")
             return "\n\ndef " + changed(f"{name}({body}", [lazy, *changes])
 
         tail = body[body.index("    return {\n") :]

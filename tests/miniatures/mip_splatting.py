@@ -11,7 +11,7 @@ import torch
 from numpy.lib.recfunctions import append_fields
 from plyfile import PlyData, PlyElement
 
-from miniatures.family import MODEL, RENDERER, STEP, TRAIN, Descendant, adding
+from miniatures.family import MODEL, RENDERER, STEP, TRAIN, Derived, adding
 
 
 class Added:
@@ -113,7 +113,7 @@ gaussians.save_fused_ply(args.output_ply)
 """
 
 
-class MipHost(Descendant):
+class MipHost(Derived):
     """How to drive it: filters are as old as the last rows they were computed for."""
 
     options = {"Loading": {"_kernel_size": 0.1, "ray_jitter": False}}

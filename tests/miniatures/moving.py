@@ -11,17 +11,7 @@ import torch
 
 from fragprune_plugins.testing.host import FAINT
 from fragprune_plugins.testing.rewriting import changed
-from miniatures.family import (
-    MODEL,
-    RADII,
-    RENDERER,
-    SCENE,
-    TRAIN,
-    Descendant,
-    Growth,
-    Timed,
-    adding,
-)
+from miniatures.family import MODEL, RADII, RENDERER, SCENE, TRAIN, Derived, Growth, Timed, adding
 
 
 class Added:
@@ -213,10 +203,8 @@ def scene_reconstruction(opt, pipe, gaussians, scene, stage, train_iter, white):
                 largest = torch.stack(radii).max(0).values.float()
                 gaussians.max_radii2D[update] = torch.max(gaussians.max_radii2D, largest)[update]
                 gaussians.add_densification_stats(sum(each.grad for each in moved), update)
-                if (
-                    iteration > opt.densify_from_iter
-                    and iteration % opt.densification_interval == 0
-                ):
+                due = iteration % opt.densification_interval == 0
+                if iteration > opt.densify_from_iter and due:
                     threshold, extent = opt.densify_grad_threshold, scene.cameras_extent
                     gaussians.densify(threshold, 0.005, extent, None, 5, 5, "", iteration, stage)
                     gaussians.prune(threshold, 0.005, extent, None)
@@ -269,7 +257,7 @@ IDLE = ("timenet", "opacity_deform", "shs_deform")
 """Parts of the network that its defaults leave unused."""
 
 
-class MovingHost(Descendant):
+class MovingHost(Derived):
     """Small Gaussians, and a smaller network."""
 
     routine = ("densify", "prune faint", "reset opacity", "another band")
@@ -292,9 +280,7 @@ class MovingHost(Descendant):
     )
     changes = {
         MODEL: [
-            adding(
-                "from torch import nn\n", after="from scene.deformation import deform_network\n"
-            ),
+            adding("torch import nn\n", after="from scene.deformation import deform_network\n"),
             adding(
                 "[mask], lambda moment: moment[mask]\n            )\n" + OF_GROUPS,
                 after='            if len(group["params"]) == 1\n',

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from fragprune_plugins.testing.host import densify_and_prune
-from miniatures.family import MODEL, PARSE, RENDERER, SCENE, TRAIN, Descendant, adding
+from miniatures.family import MODEL, PARSE, RENDERER, SCENE, TRAIN, Derived, adding
 
 PACKAGE = "submodules/diff_gaussian_rasterization"
 FAR = "N=N, abe_split=abe_split"
@@ -77,7 +77,7 @@ class GaussianRasterizer:
 '''
 
 
-class RainHost(Descendant):
+class RainHost(Derived):
     """How to drive it; splits throw a copy far out, as they do while it warms up."""
 
     flags = (
@@ -153,9 +153,7 @@ class RainHost(Descendant):
             ),
             adding("        args.debug_from,\n", after="        vars(args),\n"),
         ],
-        "render.py": [
-            ("GaussianModel(dataset.sh_degree)", "GaussianModel(dataset.sh_degree, 0.8)")
-        ],
+        "render.py": [adding("GaussianModel(dataset.sh_degree", after=", 0.8")],
     }
     functions = (dilation, rate)
     added = (Added,)

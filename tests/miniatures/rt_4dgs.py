@@ -6,17 +6,7 @@ from types import SimpleNamespace
 import torch
 
 from fragprune_plugins.testing.host import Chance
-from miniatures.family import (
-    MODEL,
-    PARSE,
-    RENDERER,
-    SCENE,
-    TRAIN,
-    Descendant,
-    Growth,
-    Timed,
-    adding,
-)
+from miniatures.family import MODEL, PARSE, RENDERER, SCENE, TRAIN, Derived, Growth, Timed, adding
 
 ATTRIBUTES = {
     "xyz": "_xyz",
@@ -357,7 +347,7 @@ MAIN = """    parser.add_argument("--config")
 """
 
 
-class RT4DGSHost(Descendant):
+class RT4DGSHost(Derived):
     """Space and time; no PLY, several views a step, and a gradient that the loop reads."""
 
     lacks = {"model file": "it has no PLY: its checkpoints are its models"}

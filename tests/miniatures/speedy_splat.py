@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import torch
 
 from fragprune_plugins.testing.host import Chance
-from miniatures.family import RENDERER, STEP, TRAIN, Descendant, adding
+from miniatures.family import RENDERER, STEP, TRAIN, Derived, adding
 from miniatures.mini_splatting import LPIPS
 
 args = SimpleNamespace()  # the hosts' scripts hold their options under this name
@@ -35,7 +35,7 @@ def prune(iteration, gaussians, scene, pipe, background):
     gaussians.prune_gaussians(0.3, scores)
 
 
-class SpeedyHost(Descendant):
+class SpeedyHost(Derived):
     """Pruning by a score."""
 
     routine = ("prune by score", "densify and prune", "reset opacity", "another band")

@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 
-from miniatures.family import BACKWARD, MODEL, RADII, RENDERER, TRAIN, Descendant, adding
+from miniatures.family import BACKWARD, MODEL, RADII, RENDERER, TRAIN, Derived, adding
 
 MAPS = """
 
@@ -39,7 +39,7 @@ def depth_to_normal(view, depth):
 '''
 
 
-class SurfelHost(Descendant):
+class SurfelHost(Derived):
     """How to drive it: two scales, and losses of depths and normals."""
 
     options = {

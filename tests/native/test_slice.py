@@ -67,12 +67,8 @@ def test_who_is_not_there_is_nowhere_and_has_no_gradients(engine):
     absent = ~result.present
     assert 30 < int(absent.sum()) < 270
     assert (result.means[absent] == when.campos.float()).all()
-    for values in (
-        result.cov3d,
-        result.opacities,
-        result.colors,
-        *gradients(given, result).values(),
-    ):
+    moved = (result.cov3d, result.opacities, result.colors, *gradients(given, result).values())
+    for values in moved:
         assert not values[absent].any()
         assert values[result.present].any()
 

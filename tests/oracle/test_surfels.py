@@ -148,12 +148,8 @@ def test_every_output_is_that_of_rays_and_planes(kind, truncated):
     assert np.array_equal(drawn.fragments.numpy(), counts)
     assert counts.max() > 3
     # The rim's box is found to 1e-7 of its size; depths go to 13.
-    for found, expected in (
-        (drawn.image, image),
-        (drawn.alpha[0], alpha),
-        (drawn.surface, surface),
-    ):
-        assert found.numpy() == pytest.approx(expected, abs=3e-6)
+    for one, expected in ((drawn.image, image), (drawn.alpha[0], alpha), (drawn.surface, surface)):
+        assert one.numpy() == pytest.approx(expected, abs=3e-6)
     touching = {row: radius for row, radius in radii.items() if drawn.radii[row] > 0}
     assert {row: int(drawn.radii[row]) for row in touching} == touching
     assert set(drawn.fragments_per_gaussian.nonzero()[:, 0].tolist()) <= set(touching)

@@ -16,7 +16,7 @@ from reference_renderer.fragment import fragments
 
 F64 = torch.float64
 N, WIDTH, HEIGHT = 40, 34, 20
-few = settings(max_examples=25, deadline=None)
+few = settings(max_examples=25)
 
 
 def scene_of(seed, **kind):
