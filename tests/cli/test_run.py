@@ -146,27 +146,24 @@ def test_a_control_lies_beside_the_result_and_is_quoted_with_it(folder):
     assert other["control"] is None  # of another loss
 
 
-def test_thresholds_that_a_host_left_behind_are_missed(scene, tmp_path):
-    host = shutil.copytree(HOST, tmp_path / "host")
-    with (host / "train.py").open("a") as script:  # which tidies up
-        script.write("    from pathlib import Path\n")
-        script.write("    for each in Path(args.model_path).rglob('*.safetensors'):\n")
-        script.write("        each.rename(Path(args.model_path, each.name))\n")
-    words = command(scene, tmp_path / "out")
-    words[1] = host / "train.py"
-    said = ("point_cloud.fragprune.safetensors is not beside it", "there is ")
-    fails("run", *WORDS, *words, says=said, code=1)
+MOVED = ("point_cloud.fragprune.safetensors is not beside it", "there is ")
 
 
-def test_a_model_that_a_host_takes_away_is_missed(scene, tmp_path):
+@pytest.mark.parametrize(
+    ("files", "tidied", "said"),
+    [
+        ("*.safetensors", "each.rename(Path(args.model_path, each.name))", MOVED),
+        ("point_cloud.*", "each.unlink()", ("no model was saved", "last iteration")),
+    ],
+)
+def test_what_a_host_that_tidies_up_takes_away_is_missed(scene, tmp_path, files, tidied, said):
     host = shutil.copytree(HOST, tmp_path / "host")
     with (host / "train.py").open("a") as script:
         script.write("    from pathlib import Path\n")
-        script.write("    for each in Path(args.model_path).rglob('point_cloud.*'):\n")
-        script.write("        each.unlink()\n")
+        script.write(f"    for each in Path(args.model_path).rglob('{files}'): {tidied}\n")
     words = command(scene, tmp_path / "out")
     words[1] = host / "train.py"
-    fails("run", *WORDS, *words, says=("no model was saved", "last iteration"), code=1)
+    fails("run", *WORDS, *words, says=said, code=1)
 
 
 @pytest.mark.parametrize("held", [True, False])

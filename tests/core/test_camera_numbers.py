@@ -194,12 +194,8 @@ def text(tmp_path):
     (model / "cameras.txt").write_text(
         "# comment\n\n7 PINHOLE 40 20 30 25 19 11\n8 SIMPLE_PINHOLE 40 20 70 25 30\n"
     )
-    lines = [
-        f"1 {2 * HALF} 0 0 {2 * HALF} 1 2 3 7 sub/b c.png",
-        "0 0 -1",
-        "2 1 0 0 0 0 0 0 8 a.png",
-    ]
-    (model / "images.txt").write_text("# comment\n" + "\n".join(lines) + "\n\n")
+    rows = [f"1 {2 * HALF} 0 0 {2 * HALF} 1 2 3 7 sub/b c.png", "0 0 -1", "2 1 0 0 0 0 0 0 8 a.png"]
+    (model / "images.txt").write_text("# comment\n" + "\n".join(rows) + "\n\n")
 
 
 def both_in_binary(tmp_path):

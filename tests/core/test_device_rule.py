@@ -68,16 +68,12 @@ def test_what_is_not_there_or_cannot_be_drawn_on_is_refused(gpus, count, wanted,
         engines.device_for(wanted, engine)
 
 
+DRAWS = ("render", __file__, "--data", "d", "--out", "o")
+
+
 @pytest.mark.parametrize("word", ["gpu", "cuda:", "cuda:x", "cuda:-1", "mps", ""])
 @pytest.mark.parametrize(
-    "command",
-    [
-        ("render", __file__, "--data", "d", "--out", "o"),
-        ("run", "--", "train.py"),
-        ("bench",),
-        ("demo",),
-    ],
-    ids=lambda words: words[0],
+    "command", [DRAWS, ("run", "--", "train.py"), ("bench",), ("demo",)], ids=lambda words: words[0]
 )
 def test_other_words_are_usage(command, word):
     result = run(command[0], "--device", word, *command[1:])

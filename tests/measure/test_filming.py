@@ -86,7 +86,7 @@ def test_a_film_has_the_colours_of_its_pictures_and_says_which_they_are(tmp_path
     assert np.abs(frames_of(path)[2][0] - 255 * green.numpy()).max() < 4
 
 
-def test_a_failed_film_leaves_the_earlier_one(tmp_path):
+def test_a_film_that_fails_or_that_a_full_disk_cuts_off_leaves_the_earlier_one(tmp_path):
     path = tmp_path / "a.mp4"
     path.write_bytes(b"earlier")
 
@@ -96,13 +96,6 @@ def test_a_failed_film_leaves_the_earlier_one(tmp_path):
 
     with pytest.raises(RuntimeError, match="no more"):
         write_mp4(path, frames(), 10)
-    assert path.read_bytes() == b"earlier"
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_a_film_that_a_full_disk_cuts_off_leaves_the_earlier_one(tmp_path):
-    path = tmp_path / "a.mp4"
-    path.write_bytes(b"earlier")
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
     try:
@@ -111,6 +104,7 @@ def test_a_film_that_a_full_disk_cuts_off_leaves_the_earlier_one(tmp_path):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert path.read_bytes() == b"earlier"
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_render_films_an_orbit_and_a_path(tmp_path, monkeypatch):
@@ -125,16 +119,10 @@ def test_render_films_an_orbit_and_a_path(tmp_path, monkeypatch):
     size, _, pictures = frames_of(film)
     assert (size, len(pictures)) == ((tiny.SIDE, tiny.SIDE), 7)  # a frame for each camera
     assert max(float(picture.std()) for picture in pictures) > 5
+    words = ("--orbit", "--resolution", 16, "--out", tmp_path / "pictures")
+    assert len(run_json("render", model, *words)["files"]) == 4  # or pictures
     write_ply(model, tiny.cut(splat, 0.5))  # thresholds apply to films, too
     assert run_json("render", model, "--orbit", "--out", film)["truncated"]
-
-
-def test_an_orbit_can_be_pictures(tmp_path, monkeypatch):
-    monkeypatch.setattr(work, "FRAMES", 4)
-    _, model, _ = tiny.scene(tmp_path)
-    out = tmp_path / "pictures"
-    report = run_json("render", model, "--orbit", "--resolution", 16, "--out", out)
-    assert len(report["files"]) == 4
 
 
 def test_without_the_library_the_message_says_what_to_install(tmp_path, monkeypatch):

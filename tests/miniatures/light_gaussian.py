@@ -205,15 +205,12 @@ class LightGaussianHost(Derived):
         renderer.write_text(text + "\n\n" + counting)
         text = train.read_text()
         call = text[text.index("    training(\n        lp.extract") :]
-        groups = ", ".join(f"{group}.extract(args)" for group in ("lp", "op", "pp"))
+        parts = ", ".join(f"{group}.extract(args)" for group in ("lp", "op", "pp"))
         own = [parsing('"--start_pointcloud"'), adding(PARSE, after="    args.must_start = True\n")]
         scripts = {
             "train_densify_prune.py": [parsing(*PRUNING), adding(PARSE, after=NO_START)],
             "prune_finetune.py": [parsing(*PRUNING), *own, (DENSIFY, "")],
-            "distill_train.py": [
-                TEACHING,
-                (call, f"    distil({groups}, args.start_checkpoint)\n"),
-            ],
+            "distill_train.py": [TEACHING, (call, f"    distil({parts}, args.start_checkpoint)\n")],
         }
         for name, changes in scripts.items():
             (root / name).write_text(changed(text, changes))

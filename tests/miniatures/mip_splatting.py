@@ -165,10 +165,7 @@ class MipHost(Derived):
         "render.py": [
             ("pipeline, background)[", "pipeline, background, kernel_size)["),
             ("gaussians, pipeline, background):", "gaussians, pipeline, background, kernel_size):"),
-            (
-                "gaussians, pipeline, background)\n",
-                "gaussians, pipeline, background, dataset.kernel_size)\n",
-            ),
+            ("background)\n", "background, dataset.kernel_size)\n"),
             ('folder / "renders"', 'folder / "test_preds_1"'),
             ('folder / "gt"', 'folder / "gt_1"'),
         ],

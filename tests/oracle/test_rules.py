@@ -25,12 +25,8 @@ def draw(inputs, thresholds=None):
 
 
 def loss(drawn):
-    return (
-        drawn.image.square().sum()
-        + drawn.invdepth.sum()
-        + drawn.alpha.sum()
-        + drawn.fragments_per_pixel
-    )
+    sums = drawn.image.square().sum() + drawn.invdepth.sum() + drawn.alpha.sum()
+    return sums + drawn.fragments_per_pixel
 
 
 def test_only_torch_and_the_standard_library_are_imported():
