@@ -6,7 +6,7 @@ from importlib import import_module
 
 import pytest
 import torch
-from cli.commands import run as run_command
+from cli.commands import succeeds
 from miniatures.rt_4dgs import PythonHost, RigidHost, RT4DGSHost
 from miniatures.runs import miniature
 from scenes import blended
@@ -236,9 +236,7 @@ def test_train_then_finetune_moves_no_frozen_bit_and_counts_every_step(mini, con
 
 def test_thresholds_in_a_checkpoint_are_not_missed_beside_it(mini, config):
     words = ("--device", "cpu", "--engine", "reference", "--iters", 5)
-    result = run_command("run", *words, "--", *command(mini, config()))
-    assert result.exit_code == 0, result.stderr
-    assert "chkpnt17.pth" in result.stdout
+    assert "chkpnt17.pth" in succeeds("run", *words, "--", *command(mini, config())).stdout
 
 
 def test_a_checkpoint_with_thresholds_is_applied_and_learned_on(mini, config, tmp_path):

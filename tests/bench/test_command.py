@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from cli.commands import run, run_json
+from cli.commands import run, run_json, succeeds
 from finetune import tiny
 
 from fragprune_plugins.workbench.bench import timing, work
@@ -47,8 +47,7 @@ def test_every_size_and_count() -> None:
 
 
 def test_the_text_says_what_was_saved_and_how_busy_the_machine_was() -> None:
-    said = run("bench", *SMALL)
-    assert said.exit_code == 0
+    said = succeeds("bench", *SMALL)
     assert "x fewer fragments" in said.stdout
     assert "load" in said.stdout.splitlines()[-1]
     assert "round 2 of 2" in said.stderr

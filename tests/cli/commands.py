@@ -12,11 +12,15 @@ def run(*arguments: object) -> Result:
     return CliRunner().invoke(cli, [str(a) for a in arguments], catch_exceptions=False)
 
 
+def succeeds(*arguments: object) -> Result:
+    result = run(*arguments)
+    assert result.exit_code == 0, result.output
+    return result
+
+
 def run_json(command: str, *arguments: object) -> dict:
     """The one JSON object on stdout of a command that succeeds."""
-    result = run(command, "--json", *arguments)
-    assert result.exit_code == 0, result.stderr
-    return json.loads(result.stdout)
+    return json.loads(succeeds(command, "--json", *arguments).stdout)
 
 
 def run_error(*arguments: object, code: int = 1) -> dict:

@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 import pytest
-from cli.commands import run, run_json
+from cli.commands import run_json, succeeds
 from finetune import tiny
 from PIL import Image
 
@@ -67,8 +67,7 @@ def test_maps_have_the_views_pixels_and_one_scale(audited):
 
 
 def test_as_text_the_result_comes_first_and_tables_fit_a_terminal(model):
-    result = run("audit", model, "--views", 1, "--resolution", 16, "--orbit")
-    assert result.exit_code == 0
+    result = succeeds("audit", model, "--views", 1, "--resolution", 16, "--orbit")
     first, *others = result.stdout.splitlines()
     assert re.match(r"60 Gaussians draw [\d.]+ fragments per pixel, [\d.]+ ms a frame", first)
     assert "a frame of 50x50 pixels" in first

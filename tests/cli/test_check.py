@@ -5,7 +5,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from cli.commands import fails, run, run_json
+from cli.commands import fails, run, run_json, succeeds
 from core.test_verdict import fork as fork  # a fixture
 from miniatures.skeletons import skeleton
 
@@ -52,8 +52,7 @@ def test_the_host_that_fits_with_every_seam_in_its_place(host):
             file, line = seam["at"].split(":")
             name = seam["seam"].split(":")[1].split(".")[-1]
             assert f"def {name}(" in (host / file).read_text().splitlines()[int(line) - 1]
-    text = run("check", host, "--adapter", "vanilla-3dgs")
-    assert text.exit_code == 0
+    text = succeeds("check", host, "--adapter", "vanilla-3dgs")
     assert f"{MODEL}:{line_of(host, MODEL, 'def densify_and_split')}" in text.stdout
     assert f"fragprune run -- python {host / 'train.py'}" in text.stdout
 

@@ -1,11 +1,9 @@
 """Every command that draws works on the chosen device; one that is none stands for a GPU."""
 
-import json
-
 import elsewhere
 import pytest
 import torch
-from cli.commands import drawing, run
+from cli.commands import drawing, run_json, succeeds
 from finetune import tiny
 
 from fragprune_plugins import engines
@@ -46,9 +44,7 @@ def test_everything_is_on_the_device(case, scene, engine):
         "render cameras": (path, "--cameras", cameras, "--out", out),
         "bench": ("--size", "24x16", "--gaussians", 40),
     }
-    result = run(case.split()[0], *words[case], "--json")
-    assert result.exit_code == 0, result.stderr
-    report = json.loads(result.stdout)
+    report = run_json(case.split()[0], *words[case])
     row = report["results"][0] if "results" in report else report
     row = row if "device" in row else row["columns"]["truncated"]
     assert (row["engine"], row["device"]) == ("elsewhere", "meta")
@@ -66,13 +62,13 @@ def test_a_run_is_measured_there(scene, engine):
 def test_learning_there_and_here_is_the_same(scene, engine, monkeypatch):
     data, path, _, out = scene
     words = ("--data", data, "--iters", 10, "--pressure", 1e-3, "--threads", 1)
-    assert run("finetune", path, "--out", out / "there.ply", *words).exit_code == 0
+    succeeds("finetune", path, "--out", out / "there.ply", *words)
     drawn = engine.frames
-    assert run("report", out, "--data", data).exit_code == 0
+    succeeds("report", out, "--data", data)
     assert engine.frames > drawn
     monkeypatch.undo()
     installed.cache_clear()
-    assert run("finetune", path, "--out", out / "here.ply", *words).exit_code == 0
+    succeeds("finetune", path, "--out", out / "here.ply", *words)
     falloffs = [read_ply(out / f"{name}.ply").falloff for name in ("there", "here")]
     torch.testing.assert_close(*falloffs)
     assert not torch.equal(read_ply(out / "there.ply").opacity, read_ply(path).opacity)

@@ -7,7 +7,7 @@ from math import isnan
 
 import pytest
 import torch
-from cli.commands import run
+from cli.commands import succeeds
 
 from fragprune_graphdeco import GraphdecoDialect, stand_ins
 from fragprune_plugins.engines.cpu import binding
@@ -58,8 +58,7 @@ CHANGES = {
 
 
 def test_every_engine_here_agrees_and_is_timed():
-    result = run("doctor", "--prove", "--json")
-    assert result.exit_code == 0, result.stdout
+    result = succeeds("doctor", "--prove", "--json")
     proof = json.loads(result.stdout, parse_constant=pytest.fail)
     assert proof["format"] == "fragprune-proof 2"
     builds = [f"cpu ({build})" for build in binding.usable_builds()]

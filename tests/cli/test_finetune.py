@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from cli.commands import run, run_error, run_json
+from cli.commands import run, run_error, run_json, succeeds
 from finetune import tiny
 
 import fragprune_plugins as fp
@@ -24,8 +24,7 @@ from fragprune_plugins.workbench.models.formats.ply import write_ply
 def test_writes_a_pair_and_a_table(data, path, model, tmp_path):
     before, out = path.read_bytes(), tmp_path / "results" / "out.ply"
     words = ("--data", data, "--out", out, "--train", "opacity")
-    result = run("finetune", path, *words, "--iters", 10, "--pressure", 1e-3)
-    assert result.exit_code == 0, result.stderr
+    result = succeeds("finetune", path, *words, "--iters", 10, "--pressure", 1e-3)
     for said in ("PSNR, dB", "fragments per pixel", "original", "pruned", "x fewer fragments"):
         assert said in result.stdout
     share = f"A page to share: fragprune report {out.parent} --data {data}\n"
@@ -288,7 +287,6 @@ def test_divergence_is_a_stated_failure_and_writes_nothing(words, tmp_path, monk
 
 @pytest.mark.parametrize("name", ["finetune", "render", "profile", "compare", "export"])
 def test_help_teaches_by_example(name):
-    result = run(name, "--help")
-    assert result.exit_code == 0
-    assert f"fragprune {name} " in result.stdout
-    assert "--json" in result.stdout
+    said = succeeds(name, "--help").stdout
+    assert f"fragprune {name} " in said
+    assert "--json" in said

@@ -5,7 +5,7 @@ import os
 import signal
 
 import pytest
-from cli.commands import fails, run, run_json
+from cli.commands import fails, run, run_json, succeeds
 from finetune import tiny
 from finetune.several import at_step, ended
 
@@ -26,13 +26,12 @@ def killed(step, *arguments):
 
 def test_killed_twice_the_same_command_ends_with_the_same_files(tuning, tmp_path):
     whole, out = tmp_path / "whole.ply", tmp_path / "out.ply"
-    assert run(*tuning(whole)).exit_code == 0
+    succeeds(*tuning(whole))
     arguments = tuning(out)
     killed(7, *arguments)
     killed(19, *arguments)
     assert not out.exists()
-    result = run(*arguments, "--json")
-    assert result.exit_code == 0, result.stderr
+    result = succeeds(*arguments, "--json")
     assert "resuming at step" in result.stderr
     report = json.loads(result.stdout)
     assert report["resumed_at"] == 19
@@ -45,7 +44,7 @@ def test_killed_twice_the_same_command_ends_with_the_same_files(tuning, tmp_path
 @pytest.mark.usefixtures("ctrl_c")
 def test_ctrl_c_is_gone_on_from_with_the_same_gaussians(tuning, tmp_path, monkeypatch):
     whole, out = tmp_path / "whole.ply", tmp_path / "out.ply"
-    assert run(*tuning(whole, "--keep", 0.5)).exit_code == 0
+    succeeds(*tuning(whole, "--keep", 0.5))
     tiny.at_loss(monkeypatch, 7, lambda: signal.raise_signal(signal.SIGINT))
     result = run(*tuning(out, "--keep", 0.5))
     assert result.exit_code == 130
@@ -62,10 +61,9 @@ def test_a_finished_command_says_so_and_does_nothing(tuning, tmp_path, monkeypat
         patch.setattr("fragprune_plugins.workbench.finetune.api.finetune", None)  # cannot be called
         again = run_json(*tuning(out, "--iters", 2))
         assert again == first | {"already_finished": True}
-        text = run(*tuning(out, "--iters", 2))
-    assert text.exit_code == 0
-    assert "PSNR, dB" in text.stdout  # the whole report
-    assert "was finished before: nothing was done. --again" in text.stdout
+        said = succeeds(*tuning(out, "--iters", 2)).stdout
+    assert "PSNR, dB" in said  # the whole report
+    assert "was finished before: nothing was done. --again" in said
     assert run_json(*tuning(out, "--iters", 2, "--again"))["already_finished"] is False
 
 
@@ -104,4 +102,4 @@ def test_two_at_once_are_refused(tuning, tmp_path):
         refused = run(*tuning(out))
     assert refused.exit_code == 1
     assert "another process" in refused.stderr
-    assert run(*tuning(out)).exit_code == 0
+    succeeds(*tuning(out))

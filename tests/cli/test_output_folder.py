@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 import torch
-from cli.commands import fails, run, run_json
+from cli.commands import fails, run, run_json, succeeds
 from finetune import tiny
 from PIL import Image
 
@@ -27,8 +27,7 @@ def output(data, model, tmp_path):
 
 
 def test_commands_take_the_newest_model_and_the_trainings_cameras(output, tmp_path):
-    result = run("profile", output)
-    assert result.exit_code == 0
+    result = succeeds("profile", output)
     assert "iteration_10000" in result.stderr
     assert f"Photographs: {tmp_path / 'data'}" in result.stderr
     assert run_json("profile", output)["views"] == 2
@@ -173,7 +172,7 @@ def test_a_model_elsewhere_needs_data(path):
 def test_a_training_that_held_nothing_out_is_warned_of(data, model, tmp_path, caplog, beside):
     output = tiny.host_output(tmp_path / "out", data, model, eval=False)
     more = ("--data", data, "--white-background") if beside else ()
-    assert run("profile", output, *more).exit_code == 0
+    succeeds("profile", output, *more)
     assert "trained without --eval" in caplog.text
 
 
@@ -246,7 +245,7 @@ def test_a_model_learns_no_photograph_it_shows_under_an_exposure(output, tmp_pat
     if refused:
         fails(*words, says=("an exposure for view00", "--self"))
     else:
-        assert run(*words).exit_code == 0
+        succeeds(*words)
 
 
 def test_figures_of_a_model_with_exposures_say_that_they_are_left_out(output):
@@ -265,7 +264,7 @@ def test_a_model_is_drawn_as_the_record_of_its_run_says(output, data, tmp_path, 
     for drawing in ({}, {"compensation": "antialiasing"}):
         said = records.Recorded(Photographs(data), (model,), drawing=drawing).as_dict()
         records.leave(model, "run", {"photographs": said})
-        assert run(*words).exit_code == 0
+        succeeds(*words)
         pictures.append(np.asarray(Image.open(next((tmp_path / "p").glob("*.png"))), int))
         psnr = run_json("profile", model, "--data", data)["psnr"]
         assert psnr == run_json("compare", model, model, "--data", data)["a"]["psnr"]

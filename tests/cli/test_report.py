@@ -8,7 +8,7 @@ import sys
 
 import pytest
 import torch
-from cli.commands import run, run_error, run_json
+from cli.commands import run, run_error, run_json, succeeds
 from finetune import tiny
 
 import fragprune_plugins as fp
@@ -100,8 +100,7 @@ def test_a_fine_tuning_without_photographs_shows_the_original_s_own_views(path, 
 
 
 def test_as_text_the_result_comes_first(out):
-    result = run("report", out, "--out", out / "page.html")
-    assert result.exit_code == 0
+    result = succeeds("report", out, "--out", out / "page.html")
     assert "x fewer fragments" in result.stdout.splitlines()[0]
     assert (out / "page.html").exists()
     assert not (out / "report.html").exists()
@@ -140,9 +139,8 @@ def test_comparisons_come_along_with_their_pictures(out, data):
 def test_without_the_photographs_there_are_curves_and_the_reason(out, data, record, tmp_path):
     record.data["photographs"]["folder"] = str(tmp_path / "moved")
     records.leave(out / "pruned", "finetune", record.data)
-    result = run("report", out)
-    assert result.exit_code == 0
-    assert "No views are shown: they need files outside of" in result.stdout
+    said = succeeds("report", out).stdout
+    assert "No views are shown: they need files outside of" in said
     assert run_json("report", out)["pictures"] == 1
     assert len(run_json("report", out, "--data", data)["views"]) > 0
     elsewhere = ("--data", tmp_path / "nowhere")

@@ -6,7 +6,7 @@ import shutil
 
 import pytest
 import torch
-from cli.commands import fails, run, run_error, run_json
+from cli.commands import fails, run, run_error, run_json, succeeds
 from finetune import tiny
 from miniatures.runs import TINY
 from miniatures.vanilla_3dgs import HOST
@@ -130,8 +130,7 @@ def test_compare_is_advised_of_nothing_that_was_not_measured(folder):
 def test_a_control_lies_beside_the_result_and_is_quoted_with_it(folder):
     (out, words), finetune = folder, ["--stage", "finetune", *WORDS]
     kept = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
-    zero = run("run", *finetune, "--control", *words)
-    assert zero.exit_code == 0, zero.stderr
+    zero = succeeds("run", *finetune, "--control", *words)
     assert zero.stdout.split("\n")[0].split() == ["original", "control", "change"]
     run("report", out / "control")
     page = (out / "control/report.html").read_text()
@@ -199,8 +198,7 @@ def test_a_finished_stage_two_says_so_and_runs_nothing(folder):
     report = run_json("run", *finetune, *words)
     assert report["already_finished"] is True
     assert (report["iterations"], report["model_after"]) == (0, str(result))
-    text = run("run", *finetune, *words)
-    assert text.exit_code == 0
+    text = succeeds("run", *finetune, *words)
     assert "is finished" in text.stdout
     assert f"fragprune compare {models(out)[0]} {result}" in text.stdout
     assert result.stat().st_mtime_ns == written
@@ -213,8 +211,7 @@ def test_a_model_that_knows_photographs_by_heart_is_told(scene, tmp_path, monkey
     out = tmp_path / "out"
     words = command(scene, out, "--densify_until_iter", 8)
     monkeypatch.setattr(trial, "forgotten", lambda *_, **__: trial.BY_HEART)
-    result = run("run", *WORDS, *words)
-    assert result.exit_code == 0, result.stderr
+    result = succeeds("run", *WORDS, *words)
     whole = len(load(models(out)[0]))
     kept = len(load(models(out)[1]))
     assert kept == round(whole * trial.KEEP)
@@ -243,8 +240,7 @@ def test_where_a_look_fails_we_learn_as_asked(scene, tmp_path, monkeypatch, capl
 
     monkeypatch.setattr(trial, "forgotten", lambda *_, **__: trial.BY_HEART)
     monkeypatch.setattr(*where, fail)
-    result = run("run", *WORDS, *command(scene, tmp_path / "out", "--densify_until_iter", 8))
-    assert result.exit_code == 0, result.stderr
+    result = succeeds("run", *WORDS, *command(scene, tmp_path / "out", "--densify_until_iter", 8))
     assert "not tried whether it knows its photographs by heart, because of" in caplog.text
     assert "Removed" not in result.stdout
     (record,) = records.find(tmp_path / "out")
@@ -283,11 +279,11 @@ def test_compare_follows_the_run_that_left_the_models(trained):
 def test_a_stage_two_that_reads_photographs_otherwise_says_so(scene, tmp_path, caplog):
     out = tmp_path / "out"
     more = ("--densify_until_iter", 8)
-    assert run("run", *WORDS, *command(scene, out, *more, "-w", "-i", "images")).exit_code == 0
+    succeeds("run", *WORDS, *command(scene, out, *more, "-w", "-i", "images"))
     assert "its training had another" not in caplog.text
     words = command(scene, out, *more, "-r", 2)
     words.remove("--eval")
-    assert run("run", "--stage", "finetune", *WORDS, *words).exit_code == 0
+    succeeds("run", "--stage", "finetune", *WORDS, *words)
     assert "its training had another resolution, white_background, eval (cfg_args)" in caplog.text
 
 
@@ -340,6 +336,4 @@ def test_joint_learning_is_measured_and_compared_with_another_training(scene, tm
     last = "point_cloud/iteration_24/point_cloud.ply"
     same = run_json("compare", plain / last, out / last)
     assert same["b"]["psnr"] == pytest.approx(measured["psnr"], rel=1e-6)
-    page = run("report", out)
-    assert page.exit_code == 0, page.stderr
-    assert "fragments per pixel drawn" in page.stdout
+    assert "fragments per pixel drawn" in succeeds("report", out).stdout

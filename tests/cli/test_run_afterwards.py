@@ -6,7 +6,7 @@ import shutil
 import signal
 
 import pytest
-from cli.commands import fails, run, run_json
+from cli.commands import fails, run, run_json, succeeds
 from core.test_verdict import fork as fork  # a fixture
 from finetune import tiny
 from miniatures.runs import TINY
@@ -53,8 +53,7 @@ def trained(photographs, tmp_path_factory):
     """The PLY of a training of the demo's host."""
     out = tmp_path_factory.mktemp("trained")
     words = ["-s", photographs, "-m", out, "--iterations", 10, *TINY]
-    result = run("run", "--stage", "off", "--device", "cpu", "--", HOST / "train.py", *words)
-    assert result.exit_code == 0, result.stderr
+    succeeds("run", "--stage", "off", "--device", "cpu", "--", HOST / "train.py", *words)
     return out / "point_cloud/iteration_10/point_cloud.ply"
 
 
@@ -72,19 +71,16 @@ def host(fork, trained, tmp_path):
 
 def test_it_trains_as_it_is_and_its_model_learns_after(host, photographs, tmp_path, capfd):
     words, folder = host(photographs), tmp_path / "out/point_cloud/iteration_9"
-    result = run("run", "--json", *WORDS, *words)
-    assert result.exit_code == 0, result.stderr
+    data = run_json("run", *WORDS, *words)
     assert "trained as it is" in capfd.readouterr().err  # stdout has the object alone
-    data = json.loads(result.stdout)
     assert data["adapter"] is None
     assert data["model_before"] == str(folder / "point_cloud.ply")
     assert read_ply(folder / "pruned.ply").falloff is not None
     assert read_ply(folder / "point_cloud.ply").falloff is None
-    zero = run("run", "--json", "--stage", "finetune", "--control", *WORDS, *words)
-    assert zero.exit_code == 0, zero.stderr
+    zero = run_json("run", "--stage", "finetune", "--control", *WORDS, *words)
     assert read_ply(folder / "control.ply").falloff is None
-    again = run("run", "--json", "--stage", "finetune", "--again", *WORDS, *words)
-    assert json.loads(again.stdout)["control"] == json.loads(zero.stdout)["after"]
+    again = run_json("run", "--stage", "finetune", "--again", *WORDS, *words)
+    assert again["control"] == zero["after"]
 
 
 def test_a_model_unlike_its_photographs_learns_from_itself(host, photographs, tmp_path, trained):
@@ -93,8 +89,7 @@ def test_a_model_unlike_its_photographs_learns_from_itself(host, photographs, tm
     cameras.parent.mkdir()
     shutil.copy(trained.parents[2] / "cameras.json", cameras)
     fails("run", *WORDS, "--control", *words, says="its training compares water", code=2)
-    result = run("run", "--json", *WORDS, *words)
-    assert result.exit_code == 0, result.stderr
+    result = succeeds("run", "--json", *WORDS, *words)
     assert f"Cameras: {cameras}" in result.stderr
     data = json.loads(result.stdout)
     assert (data["target"], data["settings"]["itself"]) == ("itself", True)
@@ -105,9 +100,7 @@ def test_a_model_with_exposures_learns_from_its_own_pictures(host, photographs, 
     (tmp_path / "out").mkdir()
     rows = [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
     (tmp_path / "out/exposure.json").write_text(json.dumps({"0001": rows}))
-    result = run("run", "--json", *WORDS, *words)
-    assert result.exit_code == 0, result.stderr
-    assert json.loads(result.stdout)["target"] == "itself"
+    assert run_json("run", *WORDS, *words)["target"] == "itself"
 
 
 @pytest.mark.parametrize(("old", "new"), [("/cfg_args", "/other_args"), ("source_path=", "")])
@@ -115,8 +108,7 @@ def test_without_arguments_photographs_are_read_as_we_say(host, photographs, tmp
     words = host(photographs)
     script = words[2]
     script.write_text(script.read_text().replace(old, new))
-    result = run("run", *WORDS, *words, "-r", 2, "-w")
-    assert result.exit_code == 0, result.stderr
+    succeeds("run", *WORDS, *words, "-r", 2, "-w")
     record = beside(tmp_path / "out/point_cloud/iteration_9/pruned.ply")
     read = recorded(record).photographs
     how = {"white_background": True, "centred": True, "opaque": True}
@@ -133,7 +125,7 @@ def test_what_a_host_makes_of_its_model_in_a_folder_below_is_not_taken(host, pho
     script = words[2]
     text = script.read_text().replace("\nprint(", f"\nshutil.copytree({COPIES})\nprint(")
     script.write_text(text)
-    data = json.loads(run("run", "--json", *WORDS, *words).stdout)
+    data = run_json("run", *WORDS, *words)
     assert (tmp_path / f"out{BELOW}/point_cloud.ply").exists()
     assert data["model_before"] == str(tmp_path / "out/point_cloud/iteration_9/point_cloud.ply")
 
@@ -147,8 +139,7 @@ def test_a_script_in_a_folder_of_its_codebase_is_served(host, photographs, tmp_p
     below.write_text(finds + script.read_text())
     (script.parent / "scene/__init__.py").write_text("")
     words[2] = below
-    result = run("run", *WORDS, *words)
-    assert result.exit_code == 0, result.stderr
+    succeeds("run", *WORDS, *words)
 
 
 def test_its_record_and_page_are_of_run_and_say_who_learned(host, photographs, tmp_path, caplog):
@@ -204,8 +195,8 @@ def test_an_interrupted_second_stage_is_told_how_to_go_on(host, photographs, mon
         result = run("run", *WORDS, "--dropout", 0, *words)
     assert result.exit_code == 130
     assert "The same command with --stage finetune goes on from there." in result.stdout
-    more = ("--json", "--dropout", 0, "--stage", "finetune")
-    assert json.loads(run("run", *more, *WORDS, *words).stdout)["resumed_at"] == 3
+    more = ("--dropout", 0, "--stage", "finetune")
+    assert run_json("run", *more, *WORDS, *words)["resumed_at"] == 3
 
 
 def hear_ctrl_c():

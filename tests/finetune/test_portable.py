@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from cli.commands import run, run_json
+from cli.commands import run_json, succeeds
 from finetune import tiny
 
 import fragprune_plugins as fp
@@ -61,8 +61,7 @@ def test_the_file_has_no_thresholds_and_takes_the_sidecar_of_an_earlier_one_away
     arguments = ("finetune", path, "--data", data, "--out", out, "--iters", 20)
     fp.save(out, tiny.random_model())
     sidecar.save(out, ThresholdStore(60))
-    result = run(*arguments, "--portable", "--pressure", 1e-3)
-    assert result.exit_code == 0, result.stderr
+    result = succeeds(*arguments, "--portable", "--pressure", 1e-3)
     assert not before.exists()
     header = out.read_bytes().split(b"end_header")[0]
     assert b"fragprune" not in header
