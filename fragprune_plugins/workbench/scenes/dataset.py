@@ -335,10 +335,10 @@ def load_dataset(
 def _warn_of_turned(images: Iterable[Path]) -> None:
     if lying := [image for image in images if turned(image)]:
         log.warning(
-            "%s, and %d other photographs, have an EXIF orientation. Their pixels are read as they "
-            "are stored, as COLMAP and hosts read them. If the program that found the cameras "
+            "%d of the photographs, such as %s, have an EXIF orientation. Their pixels are read as "
+            "they are stored, as COLMAP and hosts read them. If the program that found the cameras "
             "turned them, turn their pixels, too (exiftran -ai)",
-            *(printable(str(lying[0])), len(lying) - 1),
+            *(len(lying), printable(str(lying[0]))),
         )
 
 
