@@ -281,7 +281,7 @@ def test_photographs_that_are_learned_from_too_are_not_said_to_be_held_out(model
     words = ("--data", data, "--out", tmp_path / "a b.ply", "--iters", 3, "--train", "opacity")
     said = run("finetune", path, *words).stdout
     assert "on 7 views that its training had seen." in said
-    assert f'fragprune view "{tmp_path / "a b.ply"}". A page' in said  # as words of a command
+    assert f"fragprune view '{tmp_path / 'a b.ply'}'. A page" in said  # as words of a command
 
 
 SIZES = {

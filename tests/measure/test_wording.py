@@ -1,5 +1,8 @@
 """The sentence that one quotes: fragments, time and PSNR together, and the control beside them."""
 
+import os
+import shlex
+
 import pytest
 
 from fragprune_plugins.workbench.figures.wording import (
@@ -9,6 +12,7 @@ from fragprune_plugins.workbench.figures.wording import (
     gain,
     headlines,
     outcome,
+    quoted,
 )
 
 
@@ -175,3 +179,11 @@ def test_a_table_says_in_words_what_a_ratio_means(before, after, change, frame):
 def test_a_record_of_before_there_were_trials_says_nothing_of_one():
     before, after = {"gaussians": 9}, {"gaussians": 9}
     assert begun({"settings": {}, "before": before, "after": after}) == []
+
+
+@pytest.mark.skipif(os.name == "nt", reason="shells of Windows take other words")
+@pytest.mark.parametrize("path", ["a.ply", "a b.ply", 'a"b$HOME`ls`.ply', "it's.ply", "-x.ply"])
+def test_a_path_in_an_advised_command_is_one_word_and_no_option(path):
+    (word,) = shlex.split(quoted(path))
+    assert word in (path, f"./{path}")
+    assert not word.startswith("-")

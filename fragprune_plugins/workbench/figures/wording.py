@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -252,8 +254,11 @@ def next_steps(model: Path | None, folder: Path, scene: Path | None = None) -> s
 
 
 def quoted(path: object) -> str:
-    """A path as a word of a command to copy."""
-    return f'"{path}"' if " " in str(path) else str(path)
+    """A path as a word of a command to copy, for a Windows shell or another, and no option."""
+    word = f"./{path}" if str(path).startswith("-") else str(path)
+    if os.name == "nt":
+        return f'"{word}"' if " " in word else word
+    return shlex.quote(word)
 
 
 def begun(data: Mapping[str, Any]) -> list[str]:
