@@ -246,7 +246,7 @@ def _above(repo: HostRepo, adapters: list[HostAdapter], plugins: Plugins) -> str
         if fits or models_of(above, plugins)[0]:
             which = f"fits {fits.name}" if fits else "saves plain 3DGS"
             found = f"Its scripts use the folder above, which {which}, as run finds"
-            return f"{found}: fragprune check {above.root}"
+            return f"{found}: fragprune check {quoted(above.root)}"
     return ""
 
 
@@ -337,14 +337,14 @@ def judge(
         return Verdict("finetune", sentence, plain.unlike, name, differs, inside)
     if inside:
         sentence = " ".join(
-            f"Its folder {folder}/ fits {fits}: fragprune check {repo.root / folder}"
+            f"Its folder {folder}/ fits {fits}: fragprune check {quoted(repo.root / folder)}"
             for folder, fits in inside
         )
         return Verdict("inside", sentence, own.reasons[0], name, differs, inside)
     if nearest and nearest.installed and tried[nearest].held == tried[nearest].looked_up:
         package = nearest.installed[0]
         reason = f"it is the source of {package}, which is served once it is installed"
-        sentence = f"Not here: {reason}. pip install {repo.root}; fragprune check {package}"
+        sentence = f"Not here: {reason}. pip install {quoted(repo.root)}; fragprune check {package}"
         return Verdict("never", sentence, reason, name, differs)
     reason = f"{plain.folder}/: {plain.reasons[0]}" if plain.folder else plain.reasons[0]
     return Verdict("never", f"Not possible: {reason}.", reason, name, differs)

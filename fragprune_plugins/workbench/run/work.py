@@ -333,7 +333,8 @@ def _measured(summary: launch.RunSummary) -> str:
         return ""
     control = records.control_of(record.data, records.files(summary.output, below=True))
     said = wording.outcome("run", record.data, control)
-    return f"\n{said}\nCompare: fragprune compare {summary.model_before} {summary.model_after}"
+    both = " ".join(wording.quoted(model) for model in (summary.model_before, summary.model_after))
+    return f"\n{said}\nCompare: fragprune compare {both}"
 
 
 def _viewable(path: Path) -> Model | None:
