@@ -18,7 +18,7 @@ MODEL = "scene/gaussian_model.py"
         ("2dgs", RENDERER, "radii, allmap = Gauss", "radii = Gauss", "gives 2 values"),
         ("4dgaussians", "train.py", '("fine", ', '("other", ', "no phase fine in train.py"),
         ("4dgaussians", "train.py", "_{stage}_", "_", "no checkpoints of a phase in train.py"),
-        ("vanilla-3dgs", "train.py", ".update_learning_rate(", ".warm_up(", "no update_learning"),
+        ("vanilla-3dgs", "train.py", ".update_learning_rate(", ".warm(", "no update_learning_rate"),
         ("vanilla-3dgs", MODEL, "state_dict(),\n", "state_dict(), 0,\n", "capture gives 13"),
         ("light-gaussian", RENDERER, "f_count", "f_counts", "f_counts"),
         ("mcmc", "utils/reloc_utils.py", "compute_relocation", "another", "compute_rel"),

@@ -134,7 +134,9 @@ def test_a_fisheye_has_four_numbers(tmp_path, more):
 
 def test_a_frame_that_is_broken_is_named_by_its_number(tmp_path):
     broken = {"file_path": "b.png", "transform_matrix": [[1.0]]}
-    with pytest.raises(DatasetError, match=r"frames\[1\].*shape \(1, 1\), not \(4, 4\) or"):
+    with pytest.raises(
+        DatasetError, match=r"frames\[1\].*shape \(1, 1\), not \(4, 4\) or \(3, 4\)"
+    ):
         read(tmp_path, frames=[*transforms()["frames"], broken])
 
 

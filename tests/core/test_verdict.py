@@ -241,7 +241,11 @@ def test_the_nearest_host_is_of_this_family(fork):
         ('"opacity"]', '"opacity", "binding_0"]', "binding, positions relative to the triangles"),
         ('names.append("f_dc_{}".format(i))', "...", "lacks the columns f_dc"),
         (".repeat(1, 3)", ".repeat(1, 2)", "flat, with two scales"),
-        (".repeat(1, 3)", ".repeat(1, 2) if flat else scales.repeat(1, 3)", "flat, with two"),
+        (
+            ".repeat(1, 3)",
+            ".repeat(1, 2) if flat else scales.repeat(1, 3)",
+            "flat, with two scales",
+        ),
         (".repeat(1, 3)", "", "its Gaussians are round, with one scale"),
         (".repeat(1, 3)", ".repeat(1, 1)", "its Gaussians are round, with one scale"),
         ("means3D=means3D, ", "means3D + pc.net(view), ", "makes means3D from pc.net"),
