@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from fragprune_plugins.errors import UsageError, log
-from fragprune_plugins.files import sidecar
+from fragprune_plugins.files import atomic, sidecar
 from fragprune_plugins.hosts import preflight
 from fragprune_plugins.hosts.adapter import HostAdapter, ScriptAdapter
 from fragprune_plugins.hosts.choosing import choose, locate, usage
@@ -66,17 +66,17 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
         named.get(options.stage if trains else "off", stages.train_then_finetune)()
         own = str(host.flags.config or "") if host.line.config else ""
         for kept in stages.output.glob("cfg_args") if own and stages.output else ():
-            kept.write_text(kept.read_text().replace(f"{scratch}/{Path(own).name}", own))
+            with atomic.replacing(kept) as new:
+                new.write_text(kept.read_text().replace(f"{scratch}/{Path(own).name}", own))
     return stages.summary(time.perf_counter() - started)
 
 
 def _host(
     script: Path, module: str, name: str | None, plugins: Plugins
 ) -> tuple[HostRepo, HostAdapter]:
-    """The host of a script, a checkout or an installed package, and its adapter.
+    """The host of a script, or of ``python -m module``, and its adapter.
 
-    Args:
-        module: the module's name in ``python -m module``; "" for a script.
+    The host is a checkout or an installed package; ``module`` is "" for a script.
     """
     select = partial(select_adapter, plugins=plugins)
     top = module.split(".")[0]

@@ -68,25 +68,37 @@ def test_each_script_of_a_host_is_served_and_other_python_is_python(
     assert "fewer fragments" not in capfd.readouterr().out  # stdout has the object alone
 
 
+def as_nohup():
+    """A lost terminal is ignored, and so it is by all that is started."""
+    hear_ctrl_c()
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+
+
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_ends_what_runs_and_nothing_more_starts(number, code, fork, photographs, tmp_path):
-    """A shell has its background ignore Ctrl-C."""
+    """A shell has its background ignore Ctrl-C. Another training needs a while to end."""
     root = fork(root=tmp_path / "fork").root
     training = TRAINING.format(model="none", code=0, shown="").replace("import os", WAITING, 1)
     (root / "train.py").write_text(training)
-    started_ = f"python {root}/train.py -s {photographs} -m {tmp_path}/out\n"
-    inner = script_of(tmp_path, f"{started_}touch {tmp_path}/after\n{started_}", "inner.sh")
-    lines = f"nohup sleep 90 &\npython -c 'import time; time.sleep(60)' &\nsh {inner} & wait\n"
-    script = script_of(tmp_path, f"{lines}touch {tmp_path}/after\n{started_}")
+    slow = "import signal, sys\n"
+    slow += "signal.signal(signal.SIGTERM, lambda *_: time.sleep(1) or sys.exit())\n"
+    (root / "train_slow.py").write_text(training.replace("\nprint", f"\n{slow}print", 1))
+    words = f"-s {photographs} -m {tmp_path}/out\n"
+    trains = f"python {root}/train.py {words}"
+    inner = f"{trains}touch {tmp_path}/after\n{trains}"
+    lines = "nohup sleep 90 &\npython -c 'import time; time.sleep(60)' &\n"
+    lines += f"sh {script_of(tmp_path, inner, 'inner.sh')} &\npython {root}/train_slow.py {words}"
+    script = script_of(tmp_path, f"{lines}touch {tmp_path}/after\n{trains}")
     line = [sys.executable, "-m", "fragprune_plugins", "run", "--device", "cpu", "--", "sh", script]
     how = {"stdout": subprocess.PIPE, "text": True, "start_new_session": True}
-    with subprocess.Popen(list(map(str, line)), **how, preexec_fn=hear_ctrl_c) as run_:
-        pid = int(run_.stdout.readline())
+    with subprocess.Popen(list(map(str, line)), **how, preexec_fn=as_nohup) as run_:
+        pids = [int(run_.stdout.readline()) for _ in range(2)]
         run_.send_signal(number)
         assert run_.wait(60) == code
         assert not run_.communicate(timeout=30)[0]  # nobody is left who holds it
-    with pytest.raises(ProcessLookupError):
-        os.kill(pid, 0)
+    for pid in pids:
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, 0)
     assert not (tmp_path / "after").exists()
 
 

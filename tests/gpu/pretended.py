@@ -6,6 +6,7 @@ devices fails as it would on a GPU, in forward and in backward. ``main`` is the 
 """
 
 import ctypes
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -20,8 +21,10 @@ BUILDS = Path(sys.argv[1])  # of the emulation, and of what torch's own code ask
 ROOT = Path(find_spec("torch").origin).parent
 if not (BUILT := BUILDS / "pretended.so").exists():
     flags = ["-std=c++20", "-w", "-shared", "-fPIC", f"-I{ROOT}/include", f"-L{ROOT}/lib"]
-    flags += [f"-Wl,-rpath,{ROOT}/lib", "-lc10", "-ltorch_cpu", "-o", str(BUILT)]
+    mine = BUILT.with_name(f"{os.getpid()}-{BUILT.name}")  # others may be at the same
+    flags += [f"-Wl,-rpath,{ROOT}/lib", "-lc10", "-ltorch_cpu", "-o", str(mine)]
     subprocess.run(["g++", str(Path(__file__).with_suffix(".cpp")), *flags], check=True)
+    mine.replace(BUILT)
 ctypes.CDLL(str(BUILT))  # before torch, which looks once
 
 import torch  # noqa: E402

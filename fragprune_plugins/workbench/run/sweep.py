@@ -18,6 +18,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -109,14 +110,19 @@ def _anywhere(word: str) -> str:
 def _ran(words: list[str], folder: Path, environment: dict[str, str], *, quietly: bool) -> int:
     """The exit code of the script, once all that it started has ended.
 
-    A signal ends the script first, and is then heard by what is served.
+    A signal ends the script first, and is then heard by what is served. SIGHUP ends the shells
+    inside, also under nohup, which has all that it starts ignore it; no terminal sends it there.
     """
     os.mkfifo(folder / RUNNING)
     running = os.open(folder / RUNNING, os.O_RDONLY | os.O_NONBLOCK)
     with (
         sigterm_interrupts(),
         subprocess.Popen(
-            words, env=environment, stdout=2 if quietly else None, start_new_session=True
+            words,
+            env=environment,
+            stdout=2 if quietly else None,
+            start_new_session=True,
+            preexec_fn=partial(signal.signal, signal.SIGHUP, signal.SIG_DFL),
         ) as script,
     ):
         try:
