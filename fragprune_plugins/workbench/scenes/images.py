@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -47,12 +48,14 @@ def find_image(path: Path) -> Path:
     if path.is_file():
         return path
     stem = path.stem if path.suffix.lower() in SUFFIXES else path.name
+    folded = stem.casefold()
     try:
-        images = [each for each in path.parent.iterdir() if each.suffix.lower() in SUFFIXES]
+        names = [name for name in os.listdir(path.parent) if name.casefold().startswith(folded)]
     except OSError:
         return path
+    images = [each for each in map(path.with_name, names) if each.suffix.lower() in SUFFIXES]
     found = [each for each in images if each.stem == stem]
-    found = found or [each for each in images if each.stem.casefold() == stem.casefold()]
+    found = found or [each for each in images if each.stem.casefold() == folded]
     return found[0] if len(found) == 1 else path
 
 
