@@ -1,6 +1,7 @@
 """fragprune view."""
 
 import json
+import shlex
 import urllib.request
 from threading import Thread
 
@@ -39,7 +40,8 @@ def test_a_folder_with_cameras_and_photographs(data, cut, page, tmp_path):
 
 def test_the_command_that_serves_a_page_is_one_to_copy(cut, tmp_path):
     out = tmp_path / "my page"
-    assert f'http.server -d "{out}"' in run("view", cut, "--out", out).stdout
+    said = run("view", cut, "--out", out).stdout
+    assert f"http.server -d {shlex.quote(str(out))}" in said
 
 
 @pytest.mark.parametrize("name", [".", "index.html"])
