@@ -20,13 +20,12 @@ export class Drawing {
         const info = gl.getExtension("WEBGL_debug_renderer_info");
         this.renderer = gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
         // Half floats are enough for the picture. In software their blending takes twice as long.
-        const software = this.exact && /swiftshader|llvmpipe/i.test(this.renderer);
-        this.format = software ? gl.RGBA32F : gl.RGBA16F;
+        const software = /swiftshader|llvmpipe/i.test(this.renderer);
+        this.format = software && this.exact ? gl.RGBA32F : gl.RGBA16F;
         this.gl = gl;
         this.canvas = canvas;
         // Ellipses of more square pixels get octagons. In software two triangles less are worth more.
-        const large = /swiftshader|llvmpipe/i.test(this.renderer) ? Infinity : 36;
-        this.options = { fixed: false, stop: true, marks: 16, large };
+        this.options = { fixed: false, stop: true, marks: 16, large: software ? Infinity : 36 };
         this.programs = new Map();
         gl.disable(gl.DITHER);
         gl.bindVertexArray(gl.createVertexArray());

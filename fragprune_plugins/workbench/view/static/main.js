@@ -367,12 +367,14 @@ function wire(viewer) {
         $("#photograph img").src = address(camera.photograph);
         $("#photograph img").alt = $("#photograph figcaption").textContent = `Photograph ${camera.name}`;
     };
+    const look = camera => {
+        viewer.go(camera, false);
+        viewer.distance = viewer.ahead();
+    };
     const pick = chosen => {
         number = chosen;
         select.value = chosen;
-        viewer.go(scene.cameras[chosen], false);
-        viewer.distance = Math.max(0.3 * scene.radius, dot(
-            add(scene.centre, viewer.camera.position, -1), axis(viewer.camera, 2)));
+        look(scene.cameras[chosen]);
         photograph();
     };
     if (scene.cameras.length) {
@@ -398,10 +400,7 @@ function wire(viewer) {
         viewer.change(false);
     });
     $("#ask").addEventListener("click", () => $("#help").showModal());
-    $("#reset").addEventListener("click", () => {
-        viewer.go(scene.start, false);
-        viewer.distance = viewer.ahead();
-    });
+    $("#reset").addEventListener("click", () => look(scene.start));
     const bare = () => {
         document.body.classList.toggle("bare");
         viewer.change(false);

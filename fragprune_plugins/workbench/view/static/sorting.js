@@ -63,6 +63,6 @@ export function sorting() {
         const started = performance.now();
         const order = sort(data.camera);
         const milliseconds = performance.now() - started;
-        self.postMessage({ order, milliseconds, ticket: data.ticket }, [order.buffer]);
+        self.postMessage({ order, milliseconds }, [order.buffer]);
     };
 }

@@ -15,8 +15,8 @@ export class Splats {
         const harmonics = new Uint32Array(buffer, gaussians * 32);
         if (harmonics.length !== gaussians * 4 * Math.ceil((3 * (degree + 1) ** 2) / 8))
             throw new Error(`${facts.file} was cut off: load the page again.`);
-        this.geometry = table(gl, geometry, gl.RGBA32UI, 4);
-        this.harmonics = table(gl, harmonics, gl.RGBA32UI, 4);
+        this.geometry = table(gl, geometry);
+        this.harmonics = table(gl, harmonics);
         this.order = null;
         this.rows = 0; // of the order's texture
 
@@ -101,8 +101,8 @@ function upload(gl, into, words, format, each) {
     if (rest) put(rows, rest, 1, rows * ROW);
 }
 
-function table(gl, words, format, each) {
-    const made = texture(gl, format, ROW, Math.ceil(words.length / each / ROW));
-    upload(gl, made, words, gl.RGBA_INTEGER, each);
+function table(gl, words) {
+    const made = texture(gl, gl.RGBA32UI, ROW, Math.ceil(words.length / 4 / ROW));
+    upload(gl, made, words, gl.RGBA_INTEGER, 4);
     return made;
 }
