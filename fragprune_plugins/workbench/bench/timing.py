@@ -17,6 +17,7 @@ from torch import Tensor
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View, one_line
+from fragprune_plugins.workbench.bench.scene import make_scene, make_view
 from fragprune_plugins.workbench.figures.clock import standard_error, synchronize, timed
 
 Pass = Literal["forward", "forward_backward"]
@@ -52,6 +53,13 @@ def cases(
     """Both passes of a scene, each without truncation, and then with thresholds (N,) and rules."""
     plain = [Case(scene, view, splats, kind) for kind in PASSES]
     return [each for case in plain for each in (case, replace(case, thresholds=cut, rules=rules))]
+
+
+def generated(count: int, size: tuple[int, int], device: torch.device | str) -> list[Case]:
+    """The cases of the bench scene with so many Gaussians, at a size."""
+    splats, view = make_scene(count).to(device).splats(), make_view(*size).to(device)
+    cut = torch.full_like(splats.opacities, TRUNCATION)
+    return cases(f"bench-{count}", view, splats, cut, {})
 
 
 def measure(

@@ -15,7 +15,6 @@ from fragprune_plugins.errors import UsageError
 from fragprune_plugins.plugins.hooks import thresholds_for
 from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.bench import timing
-from fragprune_plugins.workbench.bench.scene import make_scene, make_view
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import open_engine
 from fragprune_plugins.workbench.commands.options import EngineOptions
@@ -56,12 +55,8 @@ def _generated(
     gaussians: tuple[int, ...], sizes: list[Size], device: torch.device
 ) -> list[timing.Case]:
     """A generated scene for each count of Gaussians and image size."""
-    cases: list[timing.Case] = []
-    for count, size in product(gaussians, sizes):
-        splats, view = make_scene(count).to(device).splats(), make_view(*size).to(device)
-        cut = torch.full_like(splats.opacities, timing.TRUNCATION)
-        cases += timing.cases(f"bench-{count}", view, splats, cut, {})
-    return cases
+    pairs = product(gaussians, sizes)
+    return [case for count, size in pairs for case in timing.generated(count, size, device)]
 
 
 def _of_model(

@@ -165,9 +165,7 @@ def _times(
     timed = [c for c in contestants if kind == "cpu" or not isinstance(c.engine, CpuEngine)]
     ours = [each for each in timed if each.ours]
     for count, size in SCENES[kind]:
-        splats, view = make_scene(count).to(kind).splats(), make_view(*size).to(kind)
-        cut = torch.full_like(splats.opacities, timing.TRUNCATION)
-        cases = timing.cases(f"bench-{count}", view, splats, cut, {})
+        cases = timing.generated(count, size, kind)
         plain = [case for case in cases if case.thresholds is None]
         rounds = [("truncation", cases, ours)]
         rounds += [("peers", plain, timed)] if len(timed) > len(ours) else []

@@ -89,20 +89,29 @@ def trained_on(model: Path) -> Photographs | None:
 
 def saw_all(model: Path) -> bool:
     """Whether the training of a model, by the arguments in its output folder, held no view out."""
-    with contextlib.suppress(DatasetError):
-        known = _arguments(model)
-        return bool(known and not known[1])
-    return False
+    known = _legible(model)
+    return bool(known and not known[1])
 
 
 def read_otherwise(model: Path, now: Photographs) -> list[str]:
     """Arguments by which the training of a model read its photographs otherwise."""
+    then, held_out = _legible(model) or (now, now.held_out)
+    names = ("images", "resolution", "white_background")
+    other = [name for name in names if getattr(then, name) != getattr(now, name)]
+    return other + ["eval"] * (held_out and not now.held_out)
+
+
+def over_white(model: Path) -> bool:
+    """Whether the training of a model, by the arguments in its output folder, drew over white."""
+    known = _legible(model)
+    return bool(known and known[0].white_background)
+
+
+def _legible(model: Path) -> tuple[Photographs, bool] | None:
+    """What ``_arguments`` gives; None also where they cannot be read."""
     with contextlib.suppress(DatasetError):
-        then, held_out = _arguments(model) or (now, now.held_out)
-        names = ("images", "resolution", "white_background")
-        other = [name for name in names if getattr(then, name) != getattr(now, name)]
-        return other + ["eval"] * (held_out and not now.held_out)
-    return []
+        return _arguments(model)
+    return None
 
 
 def _arguments(model: Path) -> tuple[Photographs, bool] | None:
@@ -137,11 +146,3 @@ def told_by(values: Mapping[str, Any]) -> Photographs:
         centred=True,
         opaque=_LATE in values or not (source / "transforms_train.json").exists(),
     )
-
-
-def over_white(model: Path) -> bool:
-    """Whether the training of a model, by the arguments in its output folder, drew over white."""
-    with contextlib.suppress(DatasetError):
-        known = _arguments(model)
-        return bool(known and known[0].white_background)
-    return False

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from fragprune_plugins.constants import ALPHA_MIN
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.workbench.models.formats.arrays import z_order
+from fragprune_plugins.workbench.models.formats.arrays import Bytes, z_order
 from fragprune_plugins.workbench.models.formats.palette import codebook, nearest
 
 CUTOFF_MAX = -2 * math.log(ALPHA_MIN)
@@ -101,7 +101,6 @@ def _pair(low: NDArray[Any], high: NDArray[Any]) -> NDArray[np.uint32]:
     return pair
 
 
-Bytes = NDArray[np.uint8]
 Words = NDArray[np.uint16]
 
 _BOOK = 256

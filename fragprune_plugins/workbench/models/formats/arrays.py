@@ -23,6 +23,10 @@ Bytes = npt.NDArray[np.uint8]
 SH_C0 = 0.28209479177387814
 """The SH basis function of degree 0: a colour is 0.5 + SH_C0 f_dc."""
 
+SH_RESTS = (0, 3, 8, 15)
+"""How many coefficients of degree 1 and more a degree has."""
+
+_SCALE_MIN = 1e-30  # some writers leave 0, which has no logarithm
 _ALPHA_EDGE = 1e-6  # an 8-bit opacity of 0 or 255 has no finite logit
 
 
@@ -77,6 +81,14 @@ def splat_of(
         thresholds=None if thresholds is None else ThresholdStore.from_falloff(thresholds),
     )
     return model if stop is None and rim == "hard" else model.with_rules(stop=stop, rim=rim)
+
+
+def logs_of(scales: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Logarithms of standard deviations; ValueError if one is negative."""
+    if (scales < 0).any():
+        raise ValueError("negative scales")
+    logs: npt.NDArray[Any] = np.log(np.maximum(scales, _SCALE_MIN))
+    return logs
 
 
 def rules_of(splat: Model) -> dict[str, Any]:

@@ -29,9 +29,7 @@ _JSON_MAX = 16 * MEBIBYTE
 _POINTS, _FLOAT, _UBYTE, _ARRAY_BUFFER = 0, 5126, 5121, 34962
 _KINDS = {5120: ("i1", 127), 5121: ("u1", 255), 5122: ("<i2", 32767), 5123: ("<u2", 65535)}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-_SCALE_MIN = 1e-30
 _SH = [f"{BASE}:SH_DEGREE_{l}_COEF_{n}" for l in range(4) for n in range(2 * l + 1)]  # noqa: E741
-_COUNTS = {1: 0, 4: 1, 9: 2, 16: 3}
 
 
 def read(reading: Reading) -> Model:
@@ -55,7 +53,7 @@ def read(reading: Reading) -> Model:
         return _accessor(scene, data, attributes[name], width)
 
     sh = [name for name in _SH if name in attributes]
-    if len(sh) not in _COUNTS or sh != _SH[: len(sh)]:
+    if len(sh) - 1 not in arrays.SH_RESTS or sh != _SH[: len(sh)]:
         raise ValueError("SH of a degree that is not whole")
     xyz = column("POSITION", 3)
     names = [(f"{BASE}:ROTATION", 4), (f"{BASE}:SCALE", 3), (f"{BASE}:OPACITY", 1)]
@@ -68,14 +66,12 @@ def read(reading: Reading) -> Model:
     if any(len(part) != len(xyz) for part in (*parts, *(() if cutoff is None else (cutoff,)))):
         raise ValueError("attributes of different lengths")
     rotation, scale, opacity, base, *rest = parts
-    if (scale < 0).any():
-        raise ValueError("negative scales")
     splat = arrays.splat_of(
         xyz=xyz,
         colours=base,
         rest=np.stack(rest, axis=1) if rest else np.zeros((len(xyz), 0, 3)),
         opacities=opacity[:, 0],
-        log_scales=np.log(np.maximum(scale, _SCALE_MIN)),
+        log_scales=arrays.logs_of(scale),
         rotations=rotation[:, [3, 0, 1, 2]],
         thresholds=None if cutoff is None else torch.from_numpy(cutoff.copy()),
         stop=None if extension is None else extension.get("stop"),

@@ -32,7 +32,6 @@ EXTRA = "fragprune_cutoff"
 _META = "meta.json"
 _META_MAX = 4 * MEBIBYTE
 _SIDE_MAX = 16383  # of a WebP
-_COEFFICIENTS = (0, 3, 8, 15)
 _PALETTE = 64  # entries in a row of the image of SH
 _SQRT2 = 2**0.5
 _FILE = UntrustedFile(
@@ -139,7 +138,7 @@ def _rest(
     bands, size = part["bands"], part["count"]
     if bands not in (1, 2, 3) or not isinstance(size, int) or not 0 < size <= 1 << 16:
         raise ValueError(f"a palette of {size!r} for {bands!r} bands")
-    wide = _COEFFICIENTS[bands]
+    wide = arrays.SH_RESTS[bands]
     pixels = _pixels(load(part["files"][0]), _PALETTE * wide * -(-size // _PALETTE))
     if pixels.shape[1] != _PALETTE * wide:
         raise ValueError(f"a palette {pixels.shape[1]} wide for {bands} bands")

@@ -15,7 +15,6 @@ from fragprune_plugins.files.reading import Reading
 from fragprune_plugins.workbench.models.formats import Format, arrays
 
 _ROW = np.dtype([("xyz", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rot", "u1", 4)])
-_SCALE_MIN = 1e-30  # some writers leave 0, which has no logarithm
 
 
 def read(reading: Reading) -> Model:
@@ -23,15 +22,13 @@ def read(reading: Reading) -> Model:
     if reading.size % _ROW.itemsize:
         raise EOFError(f"{reading.size} bytes are no multiple of {_ROW.itemsize}")
     data = np.frombuffer(reading.take(reading.size), _ROW)
-    if (data["scale"] < 0).any():
-        raise ValueError("negative standard deviations")
     rgba = data["rgba"] / np.float32(255)
     return arrays.splat_of(
         xyz=data["xyz"],
         colours=(rgba[:, :3] - 0.5) / arrays.SH_C0,
         rest=np.zeros((len(data), 0, 3)),
         opacities=rgba[:, 3],
-        log_scales=np.log(np.maximum(data["scale"], _SCALE_MIN)),
+        log_scales=arrays.logs_of(data["scale"]),
         rotations=(data["rot"].astype(np.float32) - 128) / 128,
     )
 

@@ -47,7 +47,6 @@ _ANTIALIASED, _EXTENDED = 0x1, 0x2  # bits of the flags
 _FRACTION_BITS = 12
 _COLOUR_SCALE = 0.15
 _LEVEL = 12  # of zstd, as Niantic's writer has it
-_COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15}
 _NAMED = 8  # extensions in a warning
 _SQRT_HALF = np.float32(0.5**0.5)
 
@@ -110,12 +109,12 @@ class _Header:
         magic, self.version, self.count, degree, self.bits, flags, self.streams = fields
         if magic != _MAGIC:
             raise ValueError("it does not begin with 'NGSP'")
-        if degree not in _COEFFICIENTS:
+        if degree >= len(arrays.SH_RESTS):
             raise ValueError(f"SH degree {degree}, where we draw up to 3")
         if self.bits > 23:
             raise ValueError(f"{self.bits} bits of fraction in 24")
         self.extended, self.antialiased = bool(flags & _EXTENDED), bool(flags & _ANTIALIASED)
-        widths = (9, 1, 3, 3, 3 if self.version == 2 else 4, 3 * _COEFFICIENTS[degree])
+        widths = (9, 1, 3, 3, 3 if self.version == 2 else 4, 3 * arrays.SH_RESTS[degree])
         self.sizes = [self.count * width for width in widths]
         arrays.expect_plausible(self.count, size)
 
