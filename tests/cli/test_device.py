@@ -53,7 +53,7 @@ def test_everything_is_on_the_device(case, scene, engine):
 
 def test_a_run_is_measured_there(scene, engine):
     data, path, _, _ = scene
-    before, after = measure_models(
+    _, (before, after) = measure_models(
         Recorded(Photographs(data), (path, path), filtered=True), EngineOptions(device="cuda")
     )
     assert (before["device"], after["engine"]) == ("meta", "elsewhere")

@@ -13,9 +13,9 @@ from finetune.test_losses import plain_ssim
 from fragprune_plugins.engines import losses
 from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.errors import EngineError, InputError
-from fragprune_plugins.learning.losses import SSIM_WEIGHT
+from fragprune_plugins.learning.losses import SSIM_WEIGHT, ssim_map
 from fragprune_plugins.workbench.finetune import losses as trained
-from fragprune_plugins.workbench.finetune.losses import photometric_loss, ssim
+from fragprune_plugins.workbench.finetune.losses import photometric_loss
 
 SIZES = [(1, 1), (1, 7), (5, 3), (11, 11), (26, 246), (9, 600), (129, 257)]
 """Smaller than the window, a panel to the pixel, and more than one panel and strip."""
@@ -175,7 +175,7 @@ def test_without_compiled_code_torch_does_it(monkeypatch):
 def test_fused_ssim_does_it_on_cuda_where_it_is_installed(monkeypatch):
     cuda, package = torch.device("cuda"), ModuleType("fused_ssim")
     package.__spec__ = ModuleSpec("fused_ssim", None)
-    package.fused_ssim = lambda x, y: ssim(*x, *y)  # of one image each
+    package.fused_ssim = lambda x, y: ssim_map(*x, *y).mean()  # of one image each
     monkeypatch.setitem(sys.modules, "fused_ssim", None)
     assert trained.code_for(cuda) == "torch"
     monkeypatch.setitem(sys.modules, "fused_ssim", package)

@@ -36,20 +36,6 @@ def photometric_loss(image: Tensor, target: Tensor) -> Tensor:
         from fused_ssim import fused_ssim
 
         similar: Tensor = fused_ssim(image[None], target[None])
-        return (1 - SSIM_WEIGHT) * l1(image, target) + SSIM_WEIGHT * (1 - similar)
-    return torch_loss(image, target)
-
-
-def torch_loss(image: Tensor, target: Tensor) -> Tensor:
-    """0.8 L1 + 0.2 (1 - SSIM) of two images (3, H, W), by torch, of any dtype and on any device."""
-    return (1 - SSIM_WEIGHT) * l1(image, target) + SSIM_WEIGHT * (1 - ssim(image, target))
-
-
-def l1(image: Tensor, target: Tensor) -> Tensor:
-    """Mean absolute difference of two images (3, H, W)."""
-    return (image - target).abs().mean()
-
-
-def ssim(image: Tensor, target: Tensor) -> Tensor:
-    """Mean structural similarity of two images (C, H, W) in [0, 1]; see ``ssim_map``."""
-    return ssim_map(image, target).mean()
+    else:
+        similar = ssim_map(image, target).mean()
+    return (1 - SSIM_WEIGHT) * (image - target).abs().mean() + SSIM_WEIGHT * (1 - similar)

@@ -40,13 +40,12 @@ from fragprune_plugins.workbench.commands.opening import bound_threads, open_eng
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.figures import records, wording
 from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
-from fragprune_plugins.workbench.figures.matching import matched, told_or_matched
+from fragprune_plugins.workbench.figures.matching import told_or_matched
 from fragprune_plugins.workbench.finetune.trial import Trial, tried
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.pruning import kept
 from fragprune_plugins.workbench.run.afterwards import train_then_finetune
 from fragprune_plugins.workbench.run.unserved import Unserved, unserved
-from fragprune_plugins.workbench.scenes.dataset import load_photographs
 from fragprune_plugins.workbench.scenes.generated import views_near
 from fragprune_plugins.workbench.scenes.output import read_otherwise, saw_all
 from fragprune_plugins.workbench.scenes.training import saw_held_out
@@ -100,8 +99,7 @@ def run(
         if photographs:
             try:
                 with current_gpu(engine.device), _enough_memory():
-                    photographs = _settled(photographs, engine)
-                    *first, after = measure_models(photographs, engine)
+                    photographs, (*first, after) = measure_models(photographs, engine)
                     before = first[0] if first else None
             except FragpruneError as error:  # the trained model is saved already
                 not_compared = error
@@ -259,26 +257,23 @@ def _opened(engine: EngineOptions) -> tuple[Engine, torch.device]:
     return open_engine(EngineOptions(engine.name, "cpu" if engine.device == "cpu" else "auto"))
 
 
-def _settled(read: records.Recorded, engine: EngineOptions) -> records.Recorded:
-    """The same, with photographs around the point, and of the alpha, that its first model shows.
+def measure_models(
+    read: records.Recorded, engine: EngineOptions
+) -> tuple[records.Recorded, list[dict[str, Any]]]:
+    """Measure the models on held-out views, around the point and of the alpha that the first shows.
 
     A host whose code does not always take the middle may read another by an option alone.
+
+    Returns:
+        What was read, with how photographs were; and the figures of each model.
     """
-    if read.photographs.centred is not None:
-        return read
     rasterizer, where = _opened(engine)
-    model = load(read.models[0], filtered=read.filtered, device=where)
-    host = _AsTheHost(rasterizer.name, rasterizer, read.drawing)
-    return replace(read, photographs=matched(model, read.photographs, host)[0])
-
-
-def measure_models(read: records.Recorded, engine: EngineOptions) -> list[dict[str, Any]]:
-    """Measure the models on held-out views."""
-    rasterizer, where = _opened(engine)
-    dataset = load_photographs(read.photographs)
     models = [load(path, filtered=read.filtered, device=where) for path in read.models]
+    host = _AsTheHost(rasterizer.name, rasterizer, read.drawing)
+    photographs, dataset = told_or_matched(models[0], read.photographs, host)
     candidates = [Candidate(model, read.drawing) for model in models]
-    return measure_all(candidates, dataset.test, engine=rasterizer)
+    figures = measure_all(candidates, dataset.test, engine=rasterizer)
+    return replace(read, photographs=photographs), figures
 
 
 def _describe(summary: launch.RunSummary, data: dict[str, Any]) -> str:
