@@ -134,15 +134,20 @@ struct Surfel {
   }
 };
 
-// The colour, and for its derivative the direction; given or by spherical harmonics.
-inline Vec3 surfel_colour(const fragprune_inputs& in, size_t i, Harmonics<float>& h, int& terms,
-                          Vec3& direction, float& inv_length, bool with_slope) {
-  if (in.colors) return read3(in.colors + 3 * i);
-  direction = direction_to(read3(in.campos), read3(in.means + 3 * i), inv_length);
-  terms = harmonics(in.sh_degree, direction, h, with_slope);
-  const ShRows<const float> sh = coefficient_rows(in);
-  return raw_colour(h, terms, [&](int k) { return read3(sh.at(i, k)); });
-}
+// The colour by spherical harmonics before it is clamped, and what its derivative needs.
+struct SurfelColour {
+  Harmonics<float> h;
+  int terms;
+  Vec3 direction, raw;
+  float inv_length;
+
+  SurfelColour(const fragprune_inputs& in, size_t i, bool with_slope) {
+    direction = direction_to(read3(in.campos), read3(in.means + 3 * i), inv_length);
+    terms = harmonics(in.sh_degree, direction, h, with_slope);
+    const ShRows<const float> sh = coefficient_rows(in);
+    raw = raw_colour(h, terms, [&](int k) { return read3(sh.at(i, k)); });
+  }
+};
 
 // False: nothing of it is drawn. The radius is the host's, whatever the thresholds.
 inline bool prepare_surfel(const fragprune_inputs& in, size_t i, int32_t& radius, Surfel& to) {
@@ -195,11 +200,7 @@ inline bool prepare_surfel(const fragprune_inputs& in, size_t i, int32_t& radius
   }
   if (to.x0 >= to.x1 || to.y0 >= to.y1) return false;
 
-  Harmonics<float> h;
-  int terms;
-  Vec3 direction;
-  float inv_length;
-  Vec3 c = surfel_colour(in, i, h, terms, direction, inv_length, false);
+  Vec3 c = in.colors ? read3(in.colors + 3 * i) : SurfelColour(in, i, false).raw;
   if (!(std::abs(c.x) + std::abs(c.y) + std::abs(c.z) < 1e30f)) return false;
   if (!in.colors) c = {max(c.x, 0.f), max(c.y, 0.f), max(c.z, 0.f)};
   to.colour = c;
@@ -312,20 +313,16 @@ inline void unproject_surfel(const fragprune_inputs& in, const Surfel& surfel, c
   write(to.colors, three(kByColour));
   Wide3 by_mean = {0, 0, 0};
   if (in.sh && (to.sh || to.sh_rest || to.means)) {
-    Harmonics<float> h;
-    int terms;
-    Vec3 direction;
-    float inv_length;
     const bool slope = to.means && in.sh_degree > 0;
-    const Vec3 raw = surfel_colour(in, i, h, terms, direction, inv_length, slope);
-    const Vec3 by = through_clamp(raw, narrow3(three(kByColour)));
+    const SurfelColour c(in, i, slope);
+    const Vec3 by = through_clamp(c.raw, narrow3(three(kByColour)));
     const ShRows<const float> sh = coefficient_rows(in);
     const ShRows<float> by_sh = coefficient_rows(in, to);
-    for (int k = 0; k < terms; k++)
+    for (int k = 0; k < c.terms; k++)
       if (float* row = by_sh.at(i, k))
-        for (int c = 0; c < 3; c++) row[c] = h.value[k] * (&by.x)[c];
+        for (int j = 0; j < 3; j++) row[j] = c.h.value[k] * (&by.x)[j];
     if (slope) {
-      const Vec3 d = direction_gradient(h, terms, direction, inv_length, by,
+      const Vec3 d = direction_gradient(c.h, c.terms, c.direction, c.inv_length, by,
                                         [&](int k) { return read3(sh.at(i, k)); });
       by_mean = {d.x, d.y, d.z};
     }
