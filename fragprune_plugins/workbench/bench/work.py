@@ -40,7 +40,8 @@ def bench(
     rasterizer, device = open_engine(engine)
     before = timing.load_average()
     if model is None:
-        cases = _generated(gaussians, sizes, device)
+        scenes = product(gaussians, sizes)
+        cases = [each for scene in scenes for each in timing.generated(*scene, device)]
     else:
         cases = _of_model(model, cameras, sizes, device)
     say = partial(click.echo, err=True)
@@ -49,14 +50,6 @@ def bench(
     machine = timing.describe_machine(device) | loads
     data = {"results": results, "saved": _saved(results), "machine": machine}
     return Report(data, _table(data))
-
-
-def _generated(
-    gaussians: tuple[int, ...], sizes: list[Size], device: torch.device
-) -> list[timing.Case]:
-    """A generated scene for each count of Gaussians and image size."""
-    pairs = product(gaussians, sizes)
-    return [case for count, size in pairs for case in timing.generated(count, size, device)]
 
 
 def _of_model(

@@ -252,11 +252,6 @@ def photographs_of(summary: launch.RunSummary) -> records.Recorded | None:
     return records.Recorded(summary.photographs, left, filtered=True, drawing=summary.drawing)
 
 
-def _opened(engine: EngineOptions) -> tuple[Engine, torch.device]:
-    """An engine on the host's device, if one can draw there."""
-    return open_engine(EngineOptions(engine.name, "cpu" if engine.device == "cpu" else "auto"))
-
-
 def measure_models(
     read: records.Recorded, engine: EngineOptions
 ) -> tuple[records.Recorded, list[dict[str, Any]]]:
@@ -267,7 +262,8 @@ def measure_models(
     Returns:
         What was read, with how photographs were; and the figures of each model.
     """
-    rasterizer, where = _opened(engine)
+    at = EngineOptions(engine.name, "cpu" if engine.device == "cpu" else "auto")
+    rasterizer, where = open_engine(at)  # on the host's device, if it can draw there
     models = [load(path, filtered=read.filtered, device=where) for path in read.models]
     host = _AsTheHost(rasterizer.name, rasterizer, read.drawing)
     photographs, dataset = told_or_matched(models[0], read.photographs, host)
