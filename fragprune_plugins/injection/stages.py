@@ -116,7 +116,7 @@ class Stages:
         try:
             self._execute(arguments, learn=False)
         except HostFailed as error:
-            if (saved := end()) is None:
+            if (saved := end()) is None or not starting.whole(saved):
                 raise
             said = "the host had saved %s when it failed, and stage 2 goes on: %s"
             log.warning(said, saved, str(error))

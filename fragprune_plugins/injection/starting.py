@@ -43,16 +43,11 @@ FINISHED = "stage1.fragprune-finished"
 
 
 class Start(NamedTuple):
-    """The file from which stage 2 starts.
+    """The file from which stage 2 starts."""
 
-    Attributes:
-        iteration: the host's iteration that wrote the file.
-        why: the reason for this file, for a log line.
-    """
-
-    iteration: int
+    iteration: int  # the host's, that wrote the file
     path: Path
-    why: str
+    why: str  # the reason for this file, for a log line
 
 
 def find(adapter: ScriptAdapter, host: HostCommand, output: Path | None) -> Start:
@@ -109,6 +104,13 @@ def ended(adapter: ScriptAdapter, host: HostCommand) -> Start | None:
 def files(adapter: ScriptAdapter, output: Path | None) -> list[tuple[int, Path]]:
     """(iteration, file) of every model in an output folder, the newest last."""
     return adapter.saved_iterations(output) if output else []
+
+
+def whole(path: Path) -> bool:
+    """Whether a model of stage 1 can be read to its end: a full disk cuts files off."""
+    with contextlib.suppress(ModelFileError), _FILE.reading(path):
+        return bool(PlyData.read(path) if path.suffix == ".ply" else _read_checkpoint(path))
+    return False
 
 
 def remember(start: Start, host: HostCommand, commit: str) -> None:

@@ -9,7 +9,9 @@ from cli.commands import fails, run, run_json, succeeds
 from finetune import tiny
 from finetune.several import at_step, ended
 
+from fragprune_plugins.errors import OutputError
 from fragprune_plugins.files.atomic import locked
+from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.finetune import resuming
 
 
@@ -65,6 +67,23 @@ def test_a_finished_command_says_so_and_does_nothing(tuning, tmp_path, monkeypat
     assert "PSNR, dB" in said  # the whole report
     assert "was finished before: nothing was done. --again" in said
     assert run_json(*tuning(out, "--iters", 2, "--again"))["already_finished"] is False
+
+
+def test_a_record_without_space_takes_no_figures_and_no_checkpoint(tuning, tmp_path, monkeypatch):
+    out, replacing = tmp_path / "out.ply", records.replacing
+    monkeypatch.setattr(resuming, "EVERY", 0.0)
+
+    def full(path, **options):
+        raise OutputError(str(path), "no space", "a place", "Free some.")
+
+    monkeypatch.setattr(records, "replacing", full)
+    result = run(*tuning(out, "--iters", 3), "--json")
+    assert result.exit_code == 1
+    assert json.loads(result.stdout)["after"]["psnr"] > 0
+    assert f"{out} is written, its record is not: [output]" in result.stderr
+    monkeypatch.setattr(records, "replacing", replacing)
+    assert run_json(*tuning(out, "--iters", 3))["resumed_at"] == 3
+    assert records.beside(out)
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from miniatures.vanilla_3dgs import HOST
 
 from fragprune_plugins import load
 from fragprune_plugins.adapting import HostRepo, ModelFileError, UsageError
+from fragprune_plugins.errors import OutputError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection import launch
 from fragprune_plugins.learning.schedule import USUAL_STOP
@@ -261,6 +262,17 @@ def test_where_a_gpu_has_no_room_to_measure_the_rest_is_reported(scene, tmp_path
 
 def models(out):
     return [out / f"point_cloud/iteration_{i}/point_cloud.ply" for i in (10, 17)]
+
+
+def test_figures_are_told_where_their_record_has_no_space(scene, tmp_path, monkeypatch):
+    def full(path, **_):
+        raise OutputError(str(path), "no space", "a place", "Free some.")
+
+    monkeypatch.setattr(records, "replacing", full)
+    result = run("run", "--json", *WORDS, *command(scene, tmp_path / "out"))
+    assert result.exit_code == 1
+    assert json.loads(result.stdout)["after"]["psnr"] > 0
+    assert "point_cloud.ply is written, its record is not: [output]" in result.stderr
 
 
 def test_compare_follows_the_run_that_left_the_models(trained):

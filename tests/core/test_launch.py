@@ -26,6 +26,7 @@ from fragprune_plugins.injection import process
 from fragprune_plugins.injection.command import HostCommand, split
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.injection.process import forget_modules
+from fragprune_plugins.injection.starting import FINISHED
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 CPU = RunOptions(stage="off", device="cpu")
@@ -384,6 +385,22 @@ def test_a_training_whose_evaluation_fails_goes_on_to_stage_two(host, tmp_path, 
     assert (out / "log").read_text().splitlines()[1] == f"17346 [] {checkpoint}"
     (said,) = (each.message for each in caplog.records if "ours_30000" in each.message)
     assert f"had saved {checkpoint} when it failed" in said
+
+
+FULL_DISK = """
+if not args.start_checkpoint:
+    import os
+    os.truncate(out / f"chkpnt{iteration}.pth", 300)
+    raise OSError("No space left")
+"""
+
+
+def test_a_last_checkpoint_that_is_cut_off_is_no_end_of_stage_one(host, tmp_path):
+    out = tmp_path / "out"
+    with pytest.raises(HostFailed, match="No space left"):
+        run([host(f"{STAGES}{FULL_DISK}"), "-m", str(out)], AUTO)
+    assert len((out / "log").read_text().splitlines()) == 1
+    assert not (out / FINISHED).exists()
 
 
 def test_a_training_that_fails_before_its_last_checkpoint_fails(host, tmp_path):

@@ -11,7 +11,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from fragprune_plugins.errors import RecordError
+import click
+
+from fragprune_plugins.errors import OutputError, RecordError, printable
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.reading import MEBIBYTE, UntrustedFile, lies_in
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
@@ -55,6 +57,21 @@ def leave(model: Path, command: str, data: dict[str, Any]) -> Path:
     with replacing(target, durable=True) as temporary:
         temporary.write_text(json.dumps(strict(content), indent=1) + "\n", encoding="utf-8")
     return target
+
+
+def leave_or_tell(model: Path, command: str, data: dict[str, Any]) -> int:
+    """Leave a record. If it cannot be written, say so: its figures are still to be told.
+
+    Returns:
+        The exit code: 0, or 1 without a record.
+    """
+    try:
+        leave(model, command, data)
+    except OutputError as error:
+        said = f"{model} is written, its record is not: {error}"
+        click.echo(printable(said), err=True)
+        return 1
+    return 0
 
 
 def path_beside(result: Path) -> Path:

@@ -145,10 +145,10 @@ class Finetuned:
         if photographs is not None:
             scene = photographs.folder
             more["photographs"] = records.Recorded(photographs, (asked.model, asked.out)).as_dict()
-        records.leave(asked.out, asked.command, data | more)
+        code = records.leave_or_tell(asked.out, asked.command, data | more)
         folder = output_folder(asked.out) or asked.out.parent
         then = wording.next_steps(asked.out, folder, scene)  # records name no folders
-        return Report(data, f"{text}\n{then}", exit_code=130 if result.interrupted else 0)
+        return Report(data, f"{text}\n{then}", exit_code=130 if result.interrupted else code)
 
     def _data(self, figures: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
         """What the record and ``--json`` say."""

@@ -72,8 +72,8 @@ def finetune(**options: Any) -> Report | None:
     if over.result.terminated:  # after SIGTERM there is no time for measurements
         return over.terminated()
     report = over.report(measured or over.measured(opened.engine))
-    if not over.result.interrupted:
-        opened.checkpoints.clear()  # not before: a kill while measuring goes on from it too
+    if report.exit_code == 0:  # not before: a kill while measuring goes on from it too
+        opened.checkpoints.clear()
     return report
 
 

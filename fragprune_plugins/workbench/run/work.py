@@ -85,7 +85,7 @@ def run(
         trust=trust,
         look=looking,
     )
-    before = after = None
+    before, after, code = None, None, 0
     # A host prints to stdout; with --json, stdout gets only our object.
     with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
         warmup = 0 if stage == "joint" else settings.warmup
@@ -107,8 +107,8 @@ def run(
     if summary.steps and summary.model_after:
         read = photographs and photographs.as_dict()
         more = {"curves": summary.curves, "photographs": read}
-        records.leave(summary.model_after, "run", data | more)
-    return Report(data, _describe(summary, data))
+        code = records.leave_or_tell(summary.model_after, "run", data | more)
+    return Report(data, _describe(summary, data), code)
 
 
 def _launched(command: Sequence[str], options: launch.RunOptions) -> launch.RunSummary | Unserved:
