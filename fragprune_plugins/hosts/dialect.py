@@ -55,11 +55,17 @@ class HostCall:
 
 @dataclass(frozen=True)
 class Place:
-    """A call in the host's source."""
+    """A call in the host's source.
 
-    name: str  # function, file and line, for people
-    values: tuple[str, ...] = ()  # the host's names of what comes back; () if it keeps it together
-    unread: frozenset[int] = frozenset()  # numbers of values that its function never reads again
+    Attributes:
+        name: function, file and line, for people.
+        values: what the host names the values that come back; () if it keeps them together.
+        unread: numbers of the values that its function never reads again.
+    """
+
+    name: str
+    values: tuple[str, ...] = ()
+    unread: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True)

@@ -152,18 +152,12 @@ class Photometric(Sized):
 
 @dataclass(frozen=True)
 class Library:
-    """An opened build.
+    """An opened build."""
 
-    Attributes:
-        build: baseline, avx2 or avx512.
-        lanes: pixels that one instruction handles.
-        calls: its C functions, as ctypes objects.
-    """
-
-    build: str
+    build: str  # baseline, avx2 or avx512
     path: str
-    lanes: int
-    calls: ctypes.CDLL
+    lanes: int  # pixels that one instruction handles
+    calls: ctypes.CDLL  # its C functions, as ctypes objects
 
 
 class Unavailable(Exception):  # noqa: N818 - a state of this machine
