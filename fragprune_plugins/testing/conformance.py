@@ -151,5 +151,5 @@ def _checkouts(folder: str) -> list[Path]:
     """Folders that may be checkouts of hosts: the given folder and its subfolders."""
     if not folder:
         return []
-    root = Path(folder)
+    root = Path(folder).resolve()
     return [path for path in (root, *sorted(root.iterdir())) if path.is_dir()]

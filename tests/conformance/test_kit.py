@@ -18,7 +18,7 @@ from fragprune_plugins import testing
 from fragprune_plugins.adapting import HostRepo
 from fragprune_plugins.hosts.seams import Role
 from fragprune_plugins.plugins.loading import load_plugins
-from fragprune_plugins.testing import Host, invariants
+from fragprune_plugins.testing import Host, conformance, invariants
 from fragprune_plugins.testing.fresh import FreshProcessError, NotApplicable, fresh
 from fragprune_plugins.testing.plugin import NOT_APPLICABLE, WHAT, results_of, table
 from fragprune_vanilla_3dgs import Vanilla3DGS
@@ -55,6 +55,13 @@ def test_each_fault_is_found_by_its_invariant(check, adapter, words):
     with pytest.raises(FreshProcessError) as caught:
         fresh(check, case(adapter(), examples=1))
     assert words in str(caught.value)
+
+
+def test_a_checkout_may_be_named_from_where_pytest_runs(tmp_path, monkeypatch):
+    Host().write(tmp_path / "mine")
+    monkeypatch.chdir(tmp_path)
+    checkout = conformance._checkouts(".")[-1]
+    fresh(invariants.monotone, invariants.Case(Vanilla3DGS(), Host(), checkout, examples=1))
 
 
 def test_two_rows_with_the_moments_of_one_are_found(tmp_path):

@@ -81,7 +81,8 @@ def run(folder: Path, command: str) -> str:
     }
     environment.pop("FRAGPRUNE_HOSTS", None)
     done = subprocess.run(
-        shlex.split(command),
+        command,
+        shell=True,
         cwd=folder,
         env=environment,
         capture_output=True,
