@@ -98,7 +98,8 @@ def python(tmp_path: Path) -> Callable[..., Any]:
     def run(code: str, *arguments: object, path: str | Path | None = None) -> Any:
         environment = dict(os.environ)
         if path is not None:
-            environment["PYTHONPATH"] = str(path)
+            before = (str(path), os.environ.get("PYTHONPATH", ""))
+            environment["PYTHONPATH"] = os.pathsep.join(filter(None, before))
         done = subprocess.run(
             [sys.executable, "-c", code, *map(str, arguments)],
             capture_output=True,

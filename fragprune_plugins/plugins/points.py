@@ -5,21 +5,33 @@ A package offers an object by a line in its ``pyproject.toml``, and it is import
 
 from __future__ import annotations
 
+from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from fragprune_plugins.errors import PluginError, printable
+from fragprune_plugins.errors import PluginError, log, printable
 
 
+def _owner(point: EntryPoint) -> str:
+    return point.dist.name.replace("_", "-") if point.dist else point.value
+
+
+@cache
 def offered(group: str) -> dict[str, EntryPoint]:
-    """The entry points of a group by name, sorted; of two with one name, the first that is found.
+    """The entry points of a group by name, sorted.
+
+    Of two with one name ours is taken, else the first that is found; a warning names the other.
 
     Args:
         group: such as "fragprune.commands".
     """
     points: dict[str, EntryPoint] = {}
-    for point in entry_points(group=group):
-        points.setdefault(point.name, point)
+    found = entry_points(group=group)
+    for point in sorted(found, key=lambda each: _owner(each) != "fragprune-plugins"):
+        taken = points.setdefault(point.name, point)
+        if point.value != taken.value:
+            said = "%s %s of %s is left out: %s has one of this name. Rename or uninstall it."
+            log.warning(said, group, point.name, _owner(point), _owner(taken))
     return dict(sorted(points.items()))
 
 
@@ -30,7 +42,7 @@ def load(point: EntryPoint, kind: type | tuple[type, ...] = object) -> Any:
         point: of ``offered``.
         kind: what it must be an instance of.
     """
-    owner = point.dist.name if point.dist else point.value
+    owner = _owner(point)
     try:
         loaded = point.load()
         if not isinstance(loaded, kind):

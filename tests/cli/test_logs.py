@@ -122,6 +122,18 @@ def test_a_log_that_fails_later_does_not_stop_learning(words, caplog):
     assert "log-0-CsvLog, fragprune_step: OSError" in caplog.text
 
 
+def test_a_log_that_cannot_be_closed_costs_no_result(caplog):
+    class Lines(CsvLog):
+        def close(self):
+            super().close()
+            raise SystemExit(6)
+
+    with logging_steps([Lines("/dev/null"), closed := CsvLog("/dev/null")], Plugins()):
+        pass
+    assert "Lines cannot be closed (SystemExit: 6)" in caplog.text
+    assert closed._file.closed
+
+
 def test_a_config_file_gives_the_options(data, path, tmp_path):
     """Also flags, and in a list what is given several times."""
     log, config = tmp_path / "a.csv", tmp_path / "quick.toml"

@@ -132,6 +132,38 @@ def test_one_package_adds_a_command_a_format_an_engine_and_a_log(tmp_path, pytho
     assert (tmp_path / "steps.txt").read_text().split() == ["1", "2", "3"]
 
 
+TAKEN = """
+[fragprune.commands]
+view = mine:count
+[fragprune.formats]
+spz = mine:FORMAT
+"""
+
+
+@pytest.mark.usefixtures("model")
+def test_a_name_of_ours_stays_ours_and_whoever_takes_it_is_named(tmp_path, python):
+    site = tmp_path / "site"
+    install(site, "mine", TAKEN)
+    (site / "mine.py").write_text(MODULE)
+    code = COMMANDS.replace("result.stdout", "result.output")
+    help, said = python(code, "view --help", "export model.ply --out model.spz", path=site)
+    assert "Count the Gaussians" not in help
+    assert "fragprune.commands view of mine is left out" in help
+    assert (tmp_path / "model.spz").read_bytes()[:4] != b"PK\3\4"  # as torch writes it
+    assert "model.spz" in said
+
+
+def test_a_format_that_reads_something_else_is_named(tmp_path, python):
+    site = tmp_path / "site"
+    install(site, "mine", POINTS)
+    reads = "return torch.load(reading.file, weights_only=False)"
+    (site / "mine.py").write_text(MODULE.replace(reads, "return ()"))
+    (tmp_path / "a.mine").write_bytes(b"")
+    code = COMMANDS.replace("assert not", "assert").replace("result.stdout", "result.output")
+    (said,) = python(code, "export a.mine --out a.ply", path=site)
+    assert "[plugin] format mine: tuple from a.mine; expected a Model" in said
+
+
 @pytest.mark.usefixtures("model")
 def test_an_adapter_and_a_slice_go_with_their_folders(tmp_path, python):
     """On a copy of the tree: nothing else needs them."""

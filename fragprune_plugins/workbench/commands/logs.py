@@ -18,6 +18,7 @@ import click
 from tqdm import tqdm
 
 from fragprune_plugins.errors import OutputError, UsageError
+from fragprune_plugins.errors import log as told
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import Plugins, installed
@@ -175,10 +176,19 @@ def logging_steps(logs: Sequence[Log], plugins: Plugins | None = None) -> Iterat
     with contextlib.ExitStack() as stack:
         for number, log in enumerate(logs):
             name = f"log-{number}-{type(log).__name__}"
-            stack.callback(log.close)
+            stack.callback(_close, log)
             plugins.register(_Observer(log), name)
             stack.callback(plugins.remove, name)
         yield
+
+
+def _close(log: Log) -> None:
+    """Close a log. What was learned is no worse for one that fails at it."""
+    try:
+        log.close()
+    except (Exception, SystemExit) as error:
+        kind, why = type(log), f"{type(error).__name__}: {error}"
+        told.warning("--log: %s.%s cannot be closed (%s)", kind.__module__, kind.__name__, why)
 
 
 def _values(stats: StepStats) -> dict[str, float]:
