@@ -32,7 +32,7 @@ def activate(
 
     Args:
         adapter: the adapter's name; None detects it from the host's source.
-        host: the checkout's folder; None for the folder of the running script.
+        host: the checkout's folder; None for the running script's, or a shell's current one.
         stage: "finetune" trains thresholds and what ``settings.train`` names, "joint"
             trains everything, "off" only applies thresholds of sidecars.
         from_iter: number of iterations of this run before learning begins (0 if it is resumed).
@@ -44,10 +44,11 @@ def activate(
         LateImportError: the host is already imported.
         SessionError: a session is already active.
     """
-    settings = settings or Settings()
-    plugins = installed()
+    settings, plugins = settings or Settings(), installed()
     joint = stage == "joint"
-    folder = Path(host) if host is not None else Path(sys.argv[0]).resolve().parent
+    shell = hasattr(sys, "ps1") and not hasattr(sys.modules["__main__"], "__file__")
+    begun = "-" if shell else sys.argv[0] or "-"
+    folder = Path(host) if host is not None else Path(begun).resolve().parent
     tie = partial(select_adapter, plugins=plugins)
     repo, chosen = locate(HostRepo(folder), plugins.adapters, adapter, select=tie)
     return Session(

@@ -6,16 +6,14 @@ optimizer of everything but the thresholds, tells it what happens, in this order
     begin       the step is counted and planned; new thresholds open; a due target is met
     thresholds  what one rasterization is drawn with
     dropped     a picture to learn from, without some of its Gaussians, if the settings say so
-    drew        what came of it; the fragment pressure, a term for the driver's loss, comes back
-    lost        the loss of the view drawn last went backward
+    on_drawn    what came of it; the fragment pressure, a term for the driver's loss, comes back
+    on_loss     the loss of the view drawn last went backward
     expect_sound  its gradients must be finite, before the driver's optimizer steps
     end         the driver's optimizer stepped; the thresholds step too
 
-A target (``targets``) is a ratio that thresholds are held to.
-
-Fragments "before" are those of a view drawn without thresholds at its first visit, fragments
-"after" those it was last drawn with. A speed-up is the one over the other, summed over views that
-were learned from. Results on held-out views are for the driver to measure.
+A target (``targets``) is a ratio that thresholds are held to. Fragments "before" are those of a
+view drawn without thresholds at its first visit, "after" those it was last drawn with. A speed-up
+is the one over the other, summed over views that were learned from.
 """
 
 from __future__ import annotations
@@ -29,19 +27,13 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from fragprune_plugins.errors import DivergedError, ResetError, log
+from fragprune_plugins.errors import DivergedError, EngineError, ResetError, log
+from fragprune_plugins.learning import targets
 from fragprune_plugins.learning.events import Progress, StepStats
 from fragprune_plugins.learning.finite import are_finite, expect_finite, not_finite
 from fragprune_plugins.learning.plain import numbers_of, put
 from fragprune_plugins.learning.pressure import Observation, StepViews
 from fragprune_plugins.learning.schedule import JointSchedule, Schedule, Settings, StepPlan
-from fragprune_plugins.learning.targets import (
-    CALIBRATE_AT,
-    CALIBRATION_VIEWS,
-    FEWEST,
-    TOLERANCE,
-    Target,
-)
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs, RasterOutputs
 
@@ -86,7 +78,7 @@ class Stage2:
         store: the thresholds; changed in place.
         schedule: gives the plan of each step; ``Schedule(settings)`` when None.
         truncate: gives the thresholds to draw with; the hook ``fragprune_truncate``.
-        views: by view, a call that draws it again and ends in ``drew``; a target is met on these.
+        views: by view, a call that draws it again, to ``on_drawn``; a target is met on these.
         watch: called after every step.
         parameters: gives by name the tensors that the driver trains; they are checked to be finite.
         target: what thresholds are held to; that of the settings' goal when None.
@@ -107,7 +99,7 @@ class Stage2:
         views: Mapping[Any, Callable[[], object]] = MappingProxyType({}),
         watch: Callable[[StepStats], None] | None = None,
         parameters: Callable[[], Mapping[str, Tensor]] = dict,
-        target: Target | None = None,
+        target: targets.Target | None = None,
         everywhere: Callable[[Tensor], Tensor] = lambda rows: rows,
     ) -> None:
         self.target = settings.goal.target() if target is None else target
@@ -122,6 +114,7 @@ class Stage2:
         self.parameters = parameters
         self.picture = ""  # the view's name, for messages; drivers set it before they draw
         self._open = False  # the warm-up is over
+        self._felt = False  # what is drawn now has a gradient in the thresholds
         self._held = False  # thresholds have met their target and stay
         # by picture: fragments per pixel
         self._before: dict[_Picture, Tensor] = {}
@@ -201,6 +194,7 @@ class Stage2:
         if not self.settings.goal.learns:
             return None
         values = self._truncate(inputs, self.store)
+        self._felt = values is not None and values.requires_grad
         if values is None or self.plan is None or self.learning:
             return values
         return values.detach()
@@ -260,6 +254,10 @@ class Stage2:
         self._views.draw(drawn[0], self._before[picture][0], pressed.detach())
         if not self.learning or self.pressure.value == 0:
             return None
+        if self._felt and not (pressed.requires_grad and outputs.image.requires_grad):
+            found = "a picture, or fragments per pixel, without a gradient"
+            remedy = "Choose another --engine: this one cannot learn."
+            raise EngineError("the engine", found, "both with respect to thresholds", remedy)
         return pressed * (self.pressure.value / self._views.expected)
 
     def on_loss(self, loss: Tensor) -> None:
@@ -356,7 +354,7 @@ class Stage2:
         if target is not None:
             figures |= {} if target.met is None else {target.figure: target.met}
             ratio = figures.get(target.figure)
-            reached = ratio is not None and abs(target.ratio / ratio - 1) <= TOLERANCE
+            reached = ratio is not None and abs(target.ratio / ratio - 1) <= targets.TOLERANCE
         return Progress(
             steps=self.taken,
             gaussians=len(self.store),
@@ -415,11 +413,11 @@ class Stage2:
         put(self._views, {"expected": plain["expected"]})
         put(self.pressure, plain["pressure"])
 
-    def _meet_target(self, target: Target, progress: float) -> None:
+    def _meet_target(self, target: targets.Target, progress: float) -> None:
         """Late in the run, and again before its last step, shift all thresholds onto the target."""
-        known = dict.fromkeys(view for view, _ in self._before)
-        views = evenly_spaced([view for view in known if view in self._again], CALIBRATION_VIEWS)
-        due = progress >= 1.0 or (progress >= CALIBRATE_AT and not self._held)
+        known = dict.fromkeys(view for view, _ in self._before if view in self._again)
+        views = evenly_spaced([*known], targets.CALIBRATION_VIEWS)
+        due = progress >= 1.0 or (progress >= targets.CALIBRATE_AT and not self._held)
         if not views or (self._held and not due):
             return
 
@@ -433,7 +431,7 @@ class Stage2:
                 sum(float(drawn[each]) for each in pictures)
                 for drawn in (self._before, self._after)
             )
-            return before / max(after, 1e-9) if before < FEWEST * after else math.inf
+            return before / max(after, 1e-9) if before < targets.FEWEST * after else math.inf
 
         if due:
             target.meet(self.store, ratio, views)

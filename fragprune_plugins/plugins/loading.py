@@ -115,10 +115,11 @@ class Plugins:
             raise _broken(name, "", str(error), expected) from error
         if not isinstance(plugin, HostAdapter):
             return
-        if any(other.name == plugin.name for other in self.adapters):
-            where, remedy = f"adapter {plugin.name}", "Block one of the plugins."
-            said = "offered twice; the first one is used", "one adapter per name"
-            self.findings.append(Finding("warning", "adapter-shadowed", where, *said, remedy))
+        if twin := next((each for each in self.adapters if each.name == plugin.name), None):
+            where = f"adapter {plugin.name} of plugin {name}"
+            found = f"left out: plugin {self._manager.get_name(twin)} has one of this name"
+            said = where, found, "one adapter per name", "Set FRAGPRUNE_BLOCK to one of the two."
+            self.findings.append(Finding("warning", "adapter-shadowed", *said))
             return
         self.adapters.append(plugin)
         self.adapters.sort(key=lambda each: each.name)

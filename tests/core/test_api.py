@@ -76,6 +76,14 @@ print(json.dumps(seen))
 """
 
 
+@pytest.mark.parametrize("launcher", ["", "/usr/lib/ipykernel_launcher.py"])
+def test_a_shell_finds_the_host_in_the_current_folder(fork, python, launcher):
+    code = f"import sys, json; sys.ps1 = '> '; sys.argv[0] = {launcher!r}; import fragprune_plugins"
+    code += "; print(json.dumps(fragprune_plugins.activate().adapter.name))"
+    code = f"import os; os.chdir({str(fork)!r}); {code}"
+    assert python(code) == "vanilla-3dgs"
+
+
 def test_one_line_above_the_imports_is_enough_and_below_them_it_is_refused(fork, python):
     assert python(SCRIPT, fork) == {
         "steps": 2,

@@ -12,7 +12,7 @@ from torch.optim.optimizer import register_optimizer_step_post_hook
 from fragprune_plugins import Control, Faster, Fewer, Pressure, ThresholdStore, finetune
 from fragprune_plugins.adapting import RasterInputs
 from fragprune_plugins.engines import create_engine
-from fragprune_plugins.errors import AlignmentError, DivergedError, UsageError
+from fragprune_plugins.errors import AlignmentError, DivergedError, EngineError, UsageError
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.targets import calibrate
 from fragprune_plugins.workbench.finetune import faster, loop
@@ -37,6 +37,19 @@ def test_what_is_not_named_stays_to_the_bit(model, dataset, train, moving):
         moved = not torch.equal(getattr(result.model, name), before[name])
         assert moved == (name in moving), name
         assert not getattr(result.model, name).requires_grad
+
+
+@pytest.mark.parametrize("part", ["image", "fragments_per_pixel"])
+def test_an_engine_that_gives_no_gradient_cannot_learn(model, dataset, part):
+    class Flat:
+        name = "flat"
+
+        def rasterize(self, inputs, thresholds):
+            outputs = create_engine("cpu").rasterize(inputs, thresholds)
+            return replace(outputs, **{part: getattr(outputs, part).detach()})
+
+    with pytest.raises(EngineError, match="without a gradient"):
+        finetune(model, dataset, Settings(iterations=8), engine=Flat())
 
 
 def test_nothing_waits_for_a_collection_after_it(model, dataset):

@@ -133,6 +133,8 @@ def test_an_adapter_offered_twice_is_reported():
     plugins = load_plugins([GOOD, *more])
     assert names(plugins) == ["a-host", "good-host"]
     assert codes(plugins) == [("warning", "adapter-shadowed")]
+    assert plugins.findings[0].where == "adapter good-host of plugin more"
+    assert "plugin good has one of this name" in plugins.findings[0].found
 
 
 def test_a_plugin_that_is_refused_leaves_its_name_free():
