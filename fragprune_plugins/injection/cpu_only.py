@@ -10,6 +10,7 @@ import contextlib
 import functools
 import importlib
 import re
+import threading
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -77,20 +78,17 @@ class _Event:
         return (end._time - self._time) * 1e3
 
 
-def _nothing(*_: Any, **__: Any) -> None:
+def _answering(answer: int | None) -> Any:
     """Replaces a CUDA call that has no meaning on the CPU."""
-
-
-def _zero(*_: Any, **__: Any) -> int:
-    return 0
+    return lambda *_, **__: answer
 
 
 _SUBSTITUTES: dict[str, Any] = {
     "Event": _Event,
-    **dict.fromkeys(("set_device", "synchronize", "empty_cache"), _nothing),
-    **dict.fromkeys(("reset_peak_memory_stats", "reset_max_memory_allocated"), _nothing),
-    **dict.fromkeys(("memory_allocated", "max_memory_allocated", "memory_reserved"), _zero),
-    "current_device": _zero,
+    **dict.fromkeys(("set_device", "synchronize", "empty_cache"), _answering(None)),
+    **dict.fromkeys(("reset_peak_memory_stats", "reset_max_memory_allocated"), _answering(None)),
+    **dict.fromkeys(("memory_allocated", "max_memory_allocated", "memory_reserved"), _answering(0)),
+    "current_device": _answering(0),
     "FloatTensor": torch.FloatTensor,
     "IntTensor": torch.IntTensor,
 }
@@ -101,15 +99,20 @@ def cpu_only() -> Iterator[None]:
     """Inside, torch calls that name CUDA run on the CPU, and checkpoints load to the CPU."""
     # Optimizers import torch._dynamo, which would take our substitutes for torch's functions.
     importlib.import_module("torch._dynamo")
-    load = torch.load
+    load, run = torch.load, threading.Thread.run
 
     @functools.wraps(load)
     def load_to_cpu(f: Any, map_location: Any = None, *args: Any, **kwargs: Any) -> Any:
         return load(f, _redirected(map_location or "cpu"), *args, **kwargs)
 
+    def run_redirected(thread: threading.Thread) -> None:  # a mode is its thread's own
+        with _Redirect():
+            run(thread)
+
     with (
         mock.patch.multiple(torch.cuda, **_SUBSTITUTES),
         mock.patch.object(torch, "load", load_to_cpu),
+        mock.patch.object(threading.Thread, "run", run_redirected),
         stepping_fused(),
         _Redirect(),
     ):

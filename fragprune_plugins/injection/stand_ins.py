@@ -82,11 +82,8 @@ class StandIns:
     def refuse_leftovers(self, root: Path) -> None:
         """Refuse a host that was imported in an earlier session and draws with its classes."""
         inside = f"{root}{os.sep}"
-        hosts = [
-            module
-            for module in list(sys.modules.values())
-            if str(getattr(module, "__file__", "")).startswith(inside)
-        ]
+        loaded = list(sys.modules.values())
+        hosts = [each for each in loaded if str(getattr(each, "__file__", "")).startswith(inside)]
         for name, stand_in in self._placed.items():
             for member, ours in vars(stand_in).items():
                 maker = getattr(ours, "__module__", None)

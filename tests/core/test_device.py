@@ -1,12 +1,16 @@
 """``--device cpu``: what names CUDA runs on the CPU, and afterwards nothing has happened."""
 
 import contextlib
+from concurrent.futures import ThreadPoolExecutor
+from threading import Thread
 
 import pytest
 import torch
 
 from fragprune_plugins.injection import cpu_only as redirection
 from fragprune_plugins.injection.cpu_only import cpu_only
+
+run = Thread.run
 
 FACTORIES = {
     "zeros": lambda d: torch.zeros(3, device=d),
@@ -39,6 +43,14 @@ def test_cuda_methods_return_the_tensor_itself_as_on_a_gpu_they_would():
         assert tensor.cuda(non_blocking=True) is tensor
         assert module.cuda() is module
     assert module.weight.device.type == "cpu"
+
+
+def test_threads_that_a_host_starts_are_redirected_too():
+    """Forks load their cameras in a pool of threads."""
+    with cpu_only(), ThreadPoolExecutor(2) as pool:
+        made = pool.map(lambda number: torch.full((1,), number, device="cuda").cuda(), range(9))
+        assert [each.item() for each in made] == list(range(9))
+    assert Thread.run is run
 
 
 def test_a_tensors_device_can_be_handed_on():
