@@ -129,10 +129,10 @@ def on_capture(session: SessionState, call: SeamCall) -> Any:
 
 
 def on_restore(session: SessionState, call: SeamCall) -> Any:
-    """Take thresholds out of the host's checkpoint, and let the host restore the rest."""
+    """Take up the thresholds in the host's checkpoint, and let the host restore the rest."""
     model, capture = call.model, call.how(call.first)
     held = optimizer_state(capture, f"{session.adapter.name}: checkpoint")
-    saved = held.pop(CHECKPOINT_KEY, None)
+    saved = held.get(CHECKPOINT_KEY)  # it stays: a host may restore the same one again
     capture = brought(capture, session.adapter.means(model).device)
     result = call.run(**{call.seam.needs[0]: capture})
     restore_rates(session, model)

@@ -7,12 +7,13 @@ from types import SimpleNamespace
 import elsewhere
 import pytest
 import torch
-from core.sessions import Model, follow, state
+from core.sessions import Model, Role, call, follow, state
 
 from fragprune_plugins.constants import NEUTRAL_LOGIT
 from fragprune_plugins.errors import AlignmentError, SessionError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.atomic import staging
+from fragprune_plugins.injection import saving
 from fragprune_plugins.injection import state as module
 from fragprune_plugins.learning.thresholds import ThresholdStore
 
@@ -116,3 +117,18 @@ def test_thresholds_of_another_number_of_gaussians_are_not_taken_up():
     with pytest.raises(AlignmentError, match="saved thresholds"):
         session.take_up(model, ThresholdStore(2).state_dict())
     assert model not in session.models
+
+
+def test_a_checkpoint_in_memory_can_be_restored_again():
+    """A host that goes back to its last good state may do so twice."""
+    session = state()
+    model, known = follow(session)
+    session.rates[model] = {}
+    learned = known.store.logits.detach().clone()
+    kept = call(model, Role.CAPTURE, lambda: (model.optimizer.state_dict(), 7))
+    kept = saving.on_capture(session, kept)
+    for _ in range(2):
+        known.store.replace(6)  # as a new optimizer does
+        restore = call(model, Role.RESTORE, lambda kept: None, kept, how=lambda call: call.first)
+        saving.on_restore(session, restore)
+        assert torch.equal(known.store.logits, learned)
