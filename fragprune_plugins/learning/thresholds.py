@@ -52,7 +52,7 @@ class ThresholdStore:
         self._bind(torch.full((count,), NEUTRAL_LOGIT, device=device), lr)
 
     def _bind(self, logits: Tensor, lr: float) -> None:
-        self.logits = logits.detach().clone().requires_grad_(True)
+        self.logits = logits.detach().to(torch.float32, copy=True).requires_grad_(True)
         self.optimizer = torch.optim.Adam([self.logits], lr=lr, eps=EPSILON)
         # known of the logits: whether all are neutral, and whether none is; thresholds as given
         self._seen: _Noted[tuple[bool, bool]] | None = None

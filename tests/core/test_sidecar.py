@@ -29,6 +29,19 @@ def model(tmp_path):
     return path
 
 
+def test_what_is_learned_where_a_host_makes_float64_the_default_is_loaded(model):
+    torch.set_default_dtype(torch.float64)
+    try:
+        store = ThresholdStore(2)
+        store.append(1)
+        store.replace(3)
+        store.open(torch.full((3,), 0.5))
+        sidecar.save(model, store)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert torch.equal(sidecar.load(model)[0].logits, store.logits)
+
+
 @pytest.mark.parametrize(("stop", "rim"), [(None, "hard"), (0.01, "hard"), (0.01, "soft")])
 def test_what_is_saved_is_loaded_bit_for_bit(model, trained, stop, rim):
     before, trained.stop, trained.rim = model.read_bytes(), stop, rim
