@@ -298,7 +298,7 @@ def test_the_page_of_the_how_to_works_as_it_stands(browser, engine, tmp_path, wh
         folder = tmp_path / name
         run("bridge", engine, "--out", str(folder))
         (folder / "index.html").write_text(page + '<link rel="icon" href="data:,">')
-        (folder / "for_viewer.ply").symlink_to(model)
+        (folder / "pruned.ply").symlink_to(model)
         (folder / "node_modules").symlink_to(engines() / "node_modules")
         with served(folder) as address, opened(browser, address, width=160, height=120) as tab:
             for _ in range(40):

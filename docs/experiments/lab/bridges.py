@@ -7,7 +7,7 @@ the engine alone with the pruned one, and the pruned one through the bridge. Eng
 default settings. Pixels of quads are counted beside milliseconds: a software renderer shows the
 work of pixels, and nothing of what a GPU's vertex units do.
 
-PRUNED has the column trunc_threshold: ``fragprune export pruned.ply --out for_viewer.ply``.
+PRUNED has the column trunc_threshold.
 """
 
 from __future__ import annotations
