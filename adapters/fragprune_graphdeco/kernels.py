@@ -6,6 +6,7 @@ The import name of a rasterizer proves nothing: forks keep it and change the ker
 from __future__ import annotations
 
 import ast
+import math
 import os
 import re
 from collections.abc import Iterator
@@ -93,25 +94,22 @@ def vendored(repo: HostRepo, package: str) -> list[Path]:
     named = [each for each in texts if each.endswith(".cu")]
     return [
         folder
-        for folder, inside in _folders(repo.root)
+        for folder, inside, _ in _folders(repo.root, _DEEPEST)
         if (name in inside and (folder / name / "__init__.py").is_file())
         or any((folder / each).is_file() for each in named)
         if any(_sources(folder))
     ]
 
 
-def _folders(root: Path) -> Iterator[tuple[Path, list[str]]]:
-    """The folders of a checkout with the names of their folders, in order."""
-    for path, inside, _ in os.walk(root):
+def _folders(root: Path, deepest: float = math.inf) -> Iterator[tuple[Path, list[str], list[str]]]:
+    """The folders below one, with the names of what is in them: folders and files, in order."""
+    for path, inside, files in os.walk(root):
         folder = Path(path)
-        inside[:] = sorted(name for name in inside if not _foreign(name))
-        yield folder, list(inside)
-        if len(folder.relative_to(root).parts) >= _DEEPEST:
+        own = (name for name in inside if not name.startswith(".") and name not in _NOT_THEIRS)
+        inside[:] = sorted(own)
+        yield folder, list(inside), sorted(files)
+        if len(folder.relative_to(root).parts) >= deepest:
             inside.clear()
-
-
-def _foreign(name: str) -> bool:
-    return name.startswith(".") or name in _NOT_THEIRS
 
 
 _CUDA_FILE = re.compile(r"[\"']([^\"'\s]+\.cu)[\"']")
@@ -129,12 +127,11 @@ def _compiled(repo: HostRepo, folder: Path) -> Iterator[Path]:
 
 def _sources(folder: Path) -> Iterator[Path]:
     """The CUDA sources of a project that draw; ``backward`` only differentiates."""
-    for path, inside, files in os.walk(folder):
-        inside[:] = sorted(name for name in inside if not _foreign(name))
-        for name in sorted(files):
-            stem, dot, ending = name.partition(".")
-            if dot and ending in ("cu", "cuh", "h") and not stem.startswith("backward"):
-                yield Path(path) / name
+    for path, _, files in _folders(folder):
+        for name in files:
+            stem, _, ending = name.partition(".")
+            if ending in ("cu", "cuh", "h") and not stem.startswith("backward"):
+                yield path / name
 
 
 def _normal(text: str) -> str:
