@@ -43,10 +43,7 @@ def changing(repo: HostRepo, seam: Seam) -> Iterator[None]:
 def rename_function(repo: HostRepo, seam: Seam) -> None:
     """Rename the seam's function."""
     path, function = _definition(repo, seam)
-    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
-    line = lines[function.lineno - 1]
-    lines[function.lineno - 1] = line.replace(f"def {function.name}", f"def {RENAMED}", 1)
-    path.write_text("".join(lines), encoding="utf-8")
+    _put(path, function.lineno, function.col_offset + len("def "), function.name)
 
 
 def rename_parameter(repo: HostRepo, seam: Seam, name: str) -> None:
@@ -56,11 +53,7 @@ def rename_parameter(repo: HostRepo, seam: Seam, name: str) -> None:
     (parameter,) = (
         each for each in (*given.posonlyargs, *given.args, *given.kwonlyargs) if each.arg == name
     )
-    lines = path.read_bytes().splitlines(keepends=True)  # columns of the syntax tree count bytes
-    line, start = lines[parameter.lineno - 1], parameter.col_offset
-    end = start + len(name.encode())
-    lines[parameter.lineno - 1] = line[:start] + RENAMED.encode() + line[end:]
-    path.write_bytes(b"".join(lines))
+    _put(path, parameter.lineno, parameter.col_offset, name)
 
 
 def unpack_one_more(repo: HostRepo, seam: Seam) -> int | None:
@@ -77,13 +70,17 @@ def unpack_one_more(repo: HostRepo, seam: Seam) -> int | None:
         for target in node.targets
         if isinstance(target, ast.Tuple) and "radii" in ast.unparse(target)
     ]
-    lines = path.read_bytes().splitlines(keepends=True)
     for target in targets:
-        first, start = target.elts[0], target.elts[0].col_offset
-        line = lines[first.lineno - 1]
-        lines[first.lineno - 1] = line[:start] + f"{RENAMED}, ".encode() + line[start:]
-    path.write_bytes(b"".join(lines))
+        _put(path, target.elts[0].lineno, target.elts[0].col_offset, "", f"{RENAMED}, ")
     return min((target.lineno for target in targets), default=None)
+
+
+def _put(path: Path, number: int, start: int, old: str, new: str = RENAMED) -> None:
+    """Replace what begins in a column of a line; columns of a syntax tree count bytes."""
+    lines = path.read_bytes().splitlines(keepends=True)
+    line = lines[number - 1]
+    lines[number - 1] = line[:start] + new.encode() + line[start + len(old.encode()) :]
+    path.write_bytes(b"".join(lines))
 
 
 def _definition(repo: HostRepo, seam: Seam) -> tuple[Path, ast.FunctionDef | ast.AsyncFunctionDef]:
