@@ -469,10 +469,8 @@ def _method_calls(tree: ast.AST) -> Iterator[tuple[ast.Call, str]]:
 
 
 def _methods(repo: HostRepo) -> dict[str, Function]:
-    for node in getattr(repo.tree(MODEL), "body", ()):
-        if isinstance(node, ast.ClassDef) and node.name == CLASS:
-            return {each.name: each for each in node.body if isinstance(each, ast.FunctionDef)}
-    return {}
+    body = getattr(repo.definition(MODEL, CLASS), "body", ())
+    return {each.name: each for each in body if isinstance(each, ast.FunctionDef)}
 
 
 def _read_methods(fork: Fork) -> None:

@@ -212,11 +212,8 @@ def _scales(model: ModelClass) -> Iterator[str]:
     """Gaussians with two scales, or with one."""
     repo, module = model.repo, model.module
     setup = every(model.method("create_from_pcd"), ast.Assign)
-    body = (
-        n for n in getattr(repo.tree(module), "body", ()) if getattr(n, "name", "") == model.name
-    )
     joined = " ".join(re.findall(r"\bcat\([\[(](.*?)[\])]", " ".join(map(text_of, setup))))
-    for each in (node for part in body for node in every(part, ast.Assign)):
+    for each in every(repo.definition(module, model.name), ast.Assign):
         wide = re.search(r"\.repeat\(1, ([12])\)( if .*)?$", text_of(each.value))
         target = text_of(each.targets[0])
         if wide and target not in joined and (each in setup or "scal" in target):

@@ -49,17 +49,15 @@ def recognised(script: Path) -> bool:
     """Whether a file is this script, in any of its versions; the one for surfels is another."""
     beside, name = HostRepo(script.parent), script.stem
     defined = all(beside.function(name, each) for each in DEFINES)
-    states = "max_steps" in defaults(beside.tree(name), "Config")
+    states = "max_steps" in defaults(beside, name, "Config")
     return defined and states and bool(beside.calls(name, "rasterization"))
 
 
-def defaults(tree: ast.Module | None, kind: str) -> dict[str, Any]:
+def defaults(repo: HostRepo, module: str, kind: str) -> dict[str, Any]:
     """The fields of a dataclass and their defaults, as source has them; None if no constant."""
-    classes = [node for node in tree.body if isinstance(node, ast.ClassDef)] if tree else []
-    lines = [line for node in classes if node.name == kind for line in node.body]
     return {
         ast.unparse(line.target): getattr(line.value, "value", None)
-        for line in lines
+        for line in getattr(repo.definition(module, kind), "body", ())
         if isinstance(line, ast.AnnAssign)
     }
 
@@ -141,11 +139,11 @@ class SimpleTrainer(Gsplat, ScriptAdapter):
             return int(stated[0])
         default = DEFAULT, "DefaultStrategy"
         module, kind = (MCMC, "MCMCStrategy") if "mcmc" in arguments else default
-        return defaults(repo.tree(module), kind).get("refine_stop_iter")
+        return defaults(repo, module, kind).get("refine_stop_iter")
 
     def _fields(self) -> dict[str, Any]:
         """The script's flags and their defaults."""
-        return defaults(HostRepo(self.script.parent).tree(self.script.stem), "Config")
+        return defaults(HostRepo(self.script.parent), self.script.stem, "Config")
 
     def photographs(self, repo: HostRepo, arguments: list[str]) -> Photographs:
         """The photographs, where the script leaves the world as it is and saves PLYs."""

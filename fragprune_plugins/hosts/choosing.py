@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from fragprune_plugins.errors import UnknownHostError
 from fragprune_plugins.hosts.adapter import HostAdapter, ScriptAdapter
 from fragprune_plugins.hosts.findings import Match
-from fragprune_plugins.hosts.source import HostRepo, imported
+from fragprune_plugins.hosts.source import HostRepo
 
 
 def attempt(repo: HostRepo, adapters: Sequence[HostAdapter]) -> dict[HostAdapter, Match]:
@@ -49,7 +49,7 @@ def locate(
             for adapter in adapters
             for package in adapter.installed[:1]
             if named == adapter.name
-            or (not name and repo.imports(package) and not (repo.root / package).is_dir())
+            or (not name and package in repo.imported and not (repo.root / package).is_dir())
         ]
         if used and not name and any(each.held for each in attempt(repo, adapters).values()):
             raise  # a host of its own, that draws by that package
@@ -63,8 +63,7 @@ def locate(
 def folder_above(repo: HostRepo) -> list[HostRepo]:
     """The folder above, which may hold all that its user has, if scripts import what lies in it."""
     above = HostRepo(repo.root.parent)
-    used = {name for each in repo.root.glob("*.py") for name in imported(repo.tree(each.stem))}
-    return [above] if any(map(above.path, used)) else []
+    return [above] if any(map(above.path, repo.imported)) else []
 
 
 def choose(

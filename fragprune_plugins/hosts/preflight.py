@@ -120,10 +120,7 @@ def _imports(body: list[ast.stmt], main: bool) -> Iterator[ast.Import | ast.Impo
         if isinstance(node, ast.Import | ast.ImportFrom):
             yield node
         elif isinstance(node, ast.With) or (
-            main
-            and isinstance(node, ast.If)
-            and isinstance(node.test, ast.Compare)
-            and "__name__" in map(ast.unparse, (node.test.left, *node.test.comparators))
+            main and isinstance(node, ast.If) and "__name__" in ast.unparse(node.test)
         ):
             yield from _imports(node.body, main)
 

@@ -159,11 +159,16 @@ class HostRepo:
             self._trees[module] = parsed(self.read(path)) if path else None
         return self._trees[module]
 
-    def function(self, module: str, attribute: str) -> Function | None:
-        """The definition at a dotted path inside a module, or None."""
+    def definition(self, module: str, attribute: str) -> ast.AST | None:
+        """The class or function at a dotted path inside a module, or None."""
         node: ast.AST | None = self.tree(module)
         for name in attribute.split("."):
             node = _definition(node, name)
+        return node
+
+    def function(self, module: str, attribute: str) -> Function | None:
+        """The function at a dotted path inside a module, or None."""
+        node = self.definition(module, attribute)
         return node if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) else None
 
     def place(self, module: str, attribute: str) -> str:
@@ -223,9 +228,11 @@ class HostRepo:
                 seen.setdefault(name, f"{module}:{lines[name]}")
         return seen
 
-    def imports(self, package: str) -> bool:
-        """Whether a script right in the folder imports a top-level package."""
-        return any(package in imported(self.tree(each.stem)) for each in self.root.glob("*.py"))
+    @property
+    def imported(self) -> set[str]:
+        """Top-level packages that scripts right in the folder import."""
+        scripts = self.root.glob("*.py")
+        return {name for each in scripts for name in imported(self.tree(each.stem))}
 
     @cached_property
     def commit(self) -> str:

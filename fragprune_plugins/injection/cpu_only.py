@@ -78,17 +78,16 @@ class _Event:
         return (end._time - self._time) * 1e3
 
 
-def _answering(answer: int | None) -> Any:
-    """Replaces a CUDA call that has no meaning on the CPU."""
-    return lambda *_, **__: answer
+def _nothing(*_: Any, **__: Any) -> int:
+    """Replaces a CUDA call that has no meaning on the CPU: device 0, and no memory in use."""
+    return 0
 
 
 _SUBSTITUTES: dict[str, Any] = {
+    **dict.fromkeys(("set_device", "synchronize", "empty_cache", "current_device"), _nothing),
+    **dict.fromkeys(("reset_peak_memory_stats", "reset_max_memory_allocated"), _nothing),
+    **dict.fromkeys(("memory_allocated", "max_memory_allocated", "memory_reserved"), _nothing),
     "Event": _Event,
-    **dict.fromkeys(("set_device", "synchronize", "empty_cache"), _answering(None)),
-    **dict.fromkeys(("reset_peak_memory_stats", "reset_max_memory_allocated"), _answering(None)),
-    **dict.fromkeys(("memory_allocated", "max_memory_allocated", "memory_reserved"), _answering(0)),
-    "current_device": _answering(0),
     "FloatTensor": torch.FloatTensor,
     "IntTensor": torch.IntTensor,
 }
