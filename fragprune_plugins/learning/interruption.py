@@ -1,4 +1,4 @@
-"""Save what was learned when SIGTERM arrives: clusters send it before they end a job."""
+"""Save what was learned when SIGTERM comes, before a job is ended, or a terminal is closed."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 from types import FrameType
 
 EXIT_CODE = 128 + signal.SIGTERM
@@ -24,6 +25,7 @@ class Terminate(KeyboardInterrupt):
 def sigterm_interrupts() -> Iterator[None]:
     """Raise ``Terminate`` on the first SIGTERM inside the block, and ignore later ones.
 
+    So does SIGHUP, where a terminal is closed, unless somebody handles or ignores it.
     Python drops an exception that a signal raises inside a finalizer; then it is raised again.
     Outside the main thread, or if SIGTERM is already ignored, the block changes nothing.
     """
@@ -33,12 +35,21 @@ def sigterm_interrupts() -> Iterator[None]:
         yield
         return
     process, unraisable = os.getpid(), sys.unraisablehook
+    hang_up = signal.getsignal(signal.SIGHUP) or signal.SIG_DFL
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         if os.getpid() != process:  # a worker that was forked off: it has nothing to save
             os._exit(EXIT_CODE)
         signal.signal(number, signal.SIG_IGN)
         raise Terminate
+
+    def hung_up(number: int, frame: FrameType | None) -> None:
+        signal.signal(number, signal.SIG_IGN)
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        for output in (1, 2):
+            if not Path(f"/dev/fd/{output}").is_file():  # what was a terminal refuses to be written
+                os.dup2(nowhere, output)
+        signal.raise_signal(signal.SIGTERM)
 
     def dropped(report: sys.UnraisableHookArgs) -> None:
         if not isinstance(report.exc_value, Terminate):
@@ -50,6 +61,7 @@ def sigterm_interrupts() -> Iterator[None]:
         again.start()
 
     signal.signal(signal.SIGTERM, interrupt)
+    signal.signal(signal.SIGHUP, hung_up if hang_up is signal.SIG_DFL else hang_up)
     sys.unraisablehook = dropped
     try:
         yield
@@ -57,3 +69,4 @@ def sigterm_interrupts() -> Iterator[None]:
         if sys.unraisablehook is dropped:
             sys.unraisablehook = unraisable
         signal.signal(signal.SIGTERM, before)
+        signal.signal(signal.SIGHUP, hang_up)

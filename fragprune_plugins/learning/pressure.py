@@ -47,19 +47,12 @@ _CURVE_SLOPE = 0.22  # d ln(speedup) / d ln(lambda), measured between 1.45x and 
 
 @dataclass(frozen=True)
 class Observation:
-    """Figures of one step that learned, for the pressure.
+    """Figures of one step that learned, for the pressure."""
 
-    Attributes:
-        progress: share of the learning that was over, 0 to 1.
-        fragments: drawn per pixel, mean over the step's views; or what else the pressure acts on.
-        ratio: before over after of what a target holds, or of the fragments.
-        loss: the photometric loss, without the pressure; NaN when not known.
-    """
-
-    progress: float
-    fragments: float
-    ratio: float
-    loss: float
+    progress: float  # share of the learning that was over, 0 to 1
+    fragments: float  # per pixel, mean over the step's views; or what else the pressure acts on
+    ratio: float  # before over after of what a target holds, or of the fragments
+    loss: float  # photometric, without the pressure; NaN when not known
 
 
 @dataclass
@@ -78,20 +71,13 @@ class ElasticPressure(PressureRule):
 
     Following it descends on ln(loss) + elasticity ln(fragments). Between the ends that is the same
     pressure for a loss of any scale, of pictures of any size, over any number of fragments.
-
-    Attributes:
-        value: lambda.
-        elasticity: per cents of the loss that a per cent of the fragments is worth.
-        least: lambda's lower end, and its value until a loss is known.
-        most: its upper end.
-        memory: steps over which loss and fragments are averaged, about a pass of the views.
     """
 
-    value: float = LEAST_PRESSURE
-    elasticity: float = ELASTICITY
-    least: float = LEAST_PRESSURE
+    value: float = LEAST_PRESSURE  # lambda
+    elasticity: float = ELASTICITY  # per cents of the loss that one of the fragments is worth
+    least: float = LEAST_PRESSURE  # lambda's lower end, and its value until a loss is known
     most: float = MOST_PRESSURE
-    memory: int = 100
+    memory: int = 100  # steps that loss and fragments are averaged over: about a pass of the views
     _steps: int = 0
     _loss: float = 0.0
     _fragments: float = 0.0

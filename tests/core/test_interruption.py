@@ -1,5 +1,6 @@
 import contextlib
 import os
+import pty
 import signal
 import sys
 import threading
@@ -48,6 +49,46 @@ def test_who_has_it_ignored_is_left_alone():
     with sigterm_interrupts():
         signal.raise_signal(signal.SIGTERM)
         assert signal.getsignal(signal.SIGTERM) is signal.SIG_IGN
+
+
+CLOSED = """
+import sys, time
+from pathlib import Path
+from fragprune_plugins.learning.interruption import Terminate, sigterm_interrupts
+
+with sigterm_interrupts():
+    try:
+        print("ready", flush=True)
+        time.sleep(60)
+    except Terminate:
+        print("saving", flush=True)
+        print("saving", file=sys.stderr, flush=True)
+        Path(sys.argv[1]).write_text("saved")
+"""
+
+
+def test_what_was_learned_is_saved_when_the_terminal_is_closed(tmp_path):
+    """Whatever is written to it fails then."""
+    saved = tmp_path / "saved"
+    process, terminal = pty.fork()
+    if process == 0:
+        os.execv(sys.executable, [sys.executable, "-c", CLOSED, str(saved)])
+    while b"ready" not in os.read(terminal, 1000):
+        pass
+    os.close(terminal)
+    _, status = os.waitpid(process, 0)
+    assert (os.waitstatus_to_exitcode(status), saved.exists()) == (0, True)
+
+
+def test_who_has_a_closed_terminal_ignored_is_left_alone():
+    """As under nohup."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with sigterm_interrupts():
+            signal.raise_signal(signal.SIGHUP)
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 @pytest.mark.parametrize("guarded", [sigterm_interrupts, between_steps])
