@@ -23,7 +23,8 @@ OPACITIES = torch.linspace(0.2, 0.9, 5)
 def drawing(store: ThresholdStore | None, fragments: float) -> SimpleNamespace:
     """What an engine gives, as far as stage 2 looks at it; falls as thresholds rise."""
     scale = 1.0 if store is None else 2 - store.values.mean()
-    return SimpleNamespace(fragments_per_pixel=torch.as_tensor(fragments * scale))
+    drawn = torch.as_tensor(fragments * scale)
+    return SimpleNamespace(fragments_per_pixel=drawn, image=drawn / 100)
 
 
 class Turns(Schedule):
