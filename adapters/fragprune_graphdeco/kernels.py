@@ -24,7 +24,23 @@ _BLENDS = re.compile(r"1(?:\.0?f?)?\s*-\s*alpha\b|\balpha\s*<\s*1")
 """What a blended alpha leaves of the light behind it, or when it is too faint to be blended."""
 _BRANCHES = re.compile(r"\balpha\s*=(?!=)([^;]+);")  # of an alpha that is declared without a value
 _JACOBIAN = re.compile(r"\bJ\s*=\s*glm::mat3(?:x3)?\s*(\([^;]+\))\s*;")
-_FILTER = re.compile(r"\bcov(?:\[0\]\[0\]|\.x)\s*\+=?\s*([\w.]+)")
+_FILTER = re.compile(r"\bcov(?:\[(?:0\]\[0|1\]\[1)\]|\.x|\.z)\s*\+=?\s*(?!cov\b)([\w.]+)")
+_NUMBERS = {
+    "fragments fainter than": (r"\balpha<\(?([\d.]+(?:/[\d.]+)?)\)?", 1 / 255),
+    "no light below": (r"\btest_T<([\d.]+)\)", 1e-4),
+    "Gaussians nearer than": (r"\bp_view\.z<=?(0\.[2-9]\d*|[1-9][\d.]*)", 0.2),
+    "Gaussians beyond this times their deviation:": (r"\bceil\(([\d.]+)\*sqrt\(", 3),
+    "projections beyond this times the view:": (r"lim[xy]=([\d.]+)\*tan_fov", 1.3),
+}
+"""What a rasterizer leaves out or limits, and the number that it does so by."""
+_COLOURS = re.compile(r"computeColorFromSH\([^;{]*\{(.*?)\breturn([^;]+);")
+_OF_COLOURS = r"max\(\w+,(vec3\()?0\.?0?\)?\)"
+_UNLIKE = re.compile(
+    r"[;{})]((?:alpha|power)\*=[^;]+|(alpha|power)=\2\*[^;]+);|(SortPairsDescending)\(|"
+    r"test_T=(?!T\*\(1(?:\.0?)?-alpha\);)([^;]+);|C\[ch\]\+=([^;]+\*alpha);|"
+    r"out_color\[[^]]*\]=(C\[ch\]|[^;]*/[^;]*);"
+)
+"""Code that blends otherwise."""
 _EWA = re.compile(  # the third row is of depth: no picture has it
     r"\((\w+)/(\w+)\.z,0\.?0?,-\(?\1\*\2\.x\)?/\(\2\.z\*\2\.z\),"
     r"0\.?0?,(\w+)/\2\.z,-\(?\3\*\2\.y\)?/\(\2\.z\*\2\.z\),[^,]+,[^,]+,[^,]+\)"
@@ -154,6 +170,7 @@ class _Project:
     def compare(self, kernel: Kernel) -> Iterator[Finding]:
         """The differences from a rule."""
         yield from self._alphas(kernel)
+        yield from self._numbers()
         if kernel.projected:
             jacobians = list(self._found(_JACOBIAN))
             if not jacobians:
@@ -196,6 +213,23 @@ class _Project:
             absent = "no alpha = min(0.99, opacity exp())"
             what = f"alpha = {_short(text)}: no exp()" if text else absent
             yield self._finding(path, position, what, kernel.says)
+
+    def _numbers(self) -> Iterator[Finding]:
+        """Other numbers than those that 3DGS leaves out fragments and Gaussians by."""
+        for path, text in self.texts.items():
+            normal = _normal(text)
+            for what, (pattern, usual) in _NUMBERS.items():
+                for found in re.findall(pattern, normal):
+                    above, _, below = found.partition("/")
+                    if not math.isclose(float(above) / float(below or 1), usual, rel_tol=0.01):
+                        yield self._finding(path, 0, f"{what} {found}", f"{usual:.4g}")
+            for match in _UNLIKE.finditer(normal):
+                found = f"it blends otherwise, {_short(match[0])}"
+                yield self._finding(path, 0, found, "T (1 - alpha), front to back")
+            for inside, given in _COLOURS.findall(normal):
+                if "+=0.5;" not in inside or not re.fullmatch(_OF_COLOURS, given):
+                    found = f"colours of harmonics are {_short(given)}"
+                    yield self._finding(path, 0, found, "max(harmonics + 0.5, 0)")
 
     def _exponent(self, path: Path, position: int, text: str) -> str | None:
         """The exponent of an alpha, with the variables that it goes through; None without exp."""

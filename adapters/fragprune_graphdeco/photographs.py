@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterable, Iterator
 
 from fragprune_graphdeco import reading
 from fragprune_graphdeco.reading import assigned, every, text_of
-from fragprune_plugins.adapting import Function, HostRepo
+from fragprune_plugins.adapting import Function, HostRepo, nodes
 
 NOT_FOUND = "what its training compares with photographs was not found"
 
@@ -21,6 +21,8 @@ _LOSS = re.compile(r"l1|l2|ssim|mse|huber|charbonnier|lpips|loss", re.IGNORECASE
 _PHOTOGRAPH = re.compile(r".+\.(original_image|image|get_image\(\))")
 _BESIDE = re.compile(r"(\w+\.)*(\w*alpha_mask|background|bg|bg_color)(\.cuda\(\))?")
 """What a photograph with an alpha channel, and the picture with it, are cut by or put on."""
+_MASK = re.compile(r"(?<!alpha_)mask|conf|uncert|valid")
+"""In names of what weighs a loss at each pixel."""
 _KEEPS = {
     *("clamp", "clip", "contiguous", "cuda", "detach", "float", "permute", "squeeze", "to"),
     *("type", "unsqueeze"),
@@ -48,10 +50,27 @@ def _of_script(repo: HostRepo, script: str) -> Iterator[str]:
                 kinds = [_kinds(function, each, gone) for each in sides]
                 if sorted(map(sorted, kinds)) == [["drawn"], ["photograph"]]:
                     why = ""
-                elif {"drawn", "photograph"} <= set.union(*kinds):
+                elif {"drawn", "photograph"} <= set.union(*kinds) or (
+                    {"photograph"} in kinds and any(_draws(function, each) for each in sides)
+                ):
                     texts = " with ".join(text_of(each)[:40] for each in sides)
                     yield f"its training compares {texts} ({repo.at(module, node.lineno)})"
+            for node in (each for each in every(function, ast.BinOp) if each not in gone):
+                weights = [e for e in (node.left, node.right) if _MASK.search(text_of(e))]
+                pairs = [pair for pair in _compared(function) if pair[0] in nodes(node)]
+                if isinstance(node.op, ast.Mult) and len(weights) == 1 and pairs:
+                    kinds = [_kinds(function, each, gone) for each in pairs[0][1]]
+                    if {"drawn", "photograph"} <= set.union(*kinds):
+                        at = repo.at(module, node.lineno)
+                        what = text_of(weights[0])[:40]
+                        yield f"its training weighs what it compares, {what} ({at})"
     yield from [why] * learns
+
+
+def _draws(function: Function, value: ast.expr) -> bool:
+    """Whether a call that is no loss makes something of the drawn picture."""
+    called = value.args if isinstance(value, ast.Call) else []
+    return any("drawn" in _kinds(function, each, ()) for each in called)
 
 
 def _compared(function: Function) -> Iterator[tuple[ast.expr, list[ast.expr]]]:
@@ -87,7 +106,7 @@ def _parts(function: Function, node: ast.expr) -> list[ast.expr]:
     """What a value is made of by keeping, cutting or blending it, or by a name; [] if otherwise."""
     if isinstance(node, ast.Subscript):
         return [node.value]
-    if isinstance(node, ast.BinOp):
+    if isinstance(node, ast.BinOp) and not isinstance(node.op, ast.Pow):
         return [node.left, node.right]
     if isinstance(node, ast.IfExp):
         return [node.body, node.orelse]
@@ -96,6 +115,12 @@ def _parts(function: Function, node: ast.expr) -> list[ast.expr]:
         return node.args[:1] if text_of(of) in ("torch", "jt") else [of]
     if not isinstance(node, ast.Name):
         return []
-    changed = (each for each in every(function, ast.AugAssign) if text_of(each.target) == node.id)
+    changed = [e.value for e in every(function, ast.AugAssign) if text_of(e.target) == node.id]
+    for each in every(function, ast.Expr):
+        owner, _, name = text_of(getattr(each.value, "func", None)).rpartition(".")
+        if owner == node.id and name.endswith("_") and name.rstrip("_") not in _KEEPS:
+            changed.append(each.value)
+    parts = (to for to, _ in assigned(function) if isinstance(to, ast.Subscript))
+    changed += [to.slice for to in parts if text_of(to.value) == node.id]
     named = ((map(text_of, getattr(to, "elts", [to])), made) for to, made in assigned(function))
-    return [*(made for names, made in named if node.id in names), *(each.value for each in changed)]
+    return [*(made for names, made in named if node.id in names), *changed]

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from fragprune_graphdeco import reading
 from fragprune_graphdeco.call import ARGUMENTS, RASTERIZER, read_calls
-from fragprune_graphdeco.kernels import ORDER, SPLAT, read_kernels
+from fragprune_graphdeco.kernels import ORDER, SPLAT, read_kernels, vendored
 from fragprune_graphdeco.photographs import unlike
 from fragprune_graphdeco.reading import ModelClass, assigned, every, first_of, passed, text_of
 from fragprune_plugins.adapting import (
@@ -41,8 +41,14 @@ _OF_CALL = re.compile(
     r"opacity|opacities|features|shs|dc|rotations?|\w*sh\w*"
 )
 """Parameters of a drawing function that move or select Gaussians, or are their values."""
-_KEEPS = ("clamp", "clamp_", "contiguous", "squeeze", "unsqueeze", "to", "permute")
+_SAME = {
+    *("clone", "contiguous", "cuda", "detach", "expand", "float", "permute", "repeat", "reshape"),
+    *("squeeze", "to", "unsqueeze", "view"),
+}
+"""Methods that keep numbers."""
+_KEEPS = {*_SAME, "clamp", "clamp_"}
 """Methods that keep the numbers of a picture."""
+_ACTIVATING = {each for names in reading.ACTIVATIONS.values() for each in names}
 _ADDED = re.compile(r"bg_color|zeros_like\(\w+\)$|\* 0\.0$")
 """What is added to a picture and leaves its Gaussians alone: a background, or zeros."""
 _PICTURES = re.compile(r"mesh_\w+|(?!clamp|use)\w+_(rgb|colou?rs?)")
@@ -244,16 +250,49 @@ def _of_saving(model: ModelClass) -> Iterator[str]:
             getter, stored = model.method(got[1]), "_scaling" if target == "scale" else "_opacity"
             if getter is None or reading.returns(getter, stored) != {"stored"}:
                 yield f"save_ply stores other values, {target} = {shown}"
-        if target in ("f_dc", "f_rest", "opacities", "scale", "rotation"):
+        if target in ("xyz", "f_dc", "f_rest", "opacities", "scale", "rotation"):
             if re.match(r"np\.(zeros|ones)", value):
                 yield f"save_ply stores no {target}: {shown}"
             if re.search(r"self\.\w+ ?[*+/-] ?self\.\w+", value):
                 yield f"save_ply stores a product or sum, {target} = {shown}"
-    for node in every(model.method("setup_functions"), ast.Assign):
-        attribute, value = getattr(node.targets[0], "attr", ""), text_of(node.value)
-        expected = reading.ACTIVATIONS.get(attribute, (value,))
-        if value not in expected and raw.get(attribute.removesuffix("_activation"), True):
-            yield f"its {attribute} is {value[:50]} ({repo.at(module, node.lineno)})"
+            elif _OTHER_NUMBERS.search(value) and not re.search(r"inverse|log", value):
+                yield f"save_ply stores other numbers, {target} = {shown}"
+    for each in _stored(model.method("save_ply")):
+        if _OTHER_NUMBERS.match(text_of(each)):
+            shown = f"{text_of(each)[:60]} ({repo.at(module, each.lineno)})"
+            yield f"save_ply stores other numbers, {shown}"
+    text = "".join([text_of(repo.tree(module)), *_scripts(repo).values()])
+    functions = every(repo.tree(module), ast.FunctionDef)
+    used = ("__init__", "setup_functions")
+    made_of = [e for e in functions if e.name in used or f".{e.name}(" in text]
+    own = [e for e in getattr(repo.tree(module), "body", ()) if isinstance(e, ast.Assign)]
+    places: list[tuple[str, ast.AST]] = [(module, each) for each in (*made_of, *own)]
+    places += [(each, tree) for each in _training(repo) if (tree := repo.tree(each))]
+    for place, part in places:
+        for to, made in assigned(part):
+            attribute, value = getattr(to, "attr", ""), text_of(made)
+            expected = reading.ACTIVATIONS.get(attribute, (value,))
+            if value not in expected and raw.get(attribute.removesuffix("_activation"), True):
+                yield f"its {attribute} is {value[:50]} ({repo.at(place, to.lineno)})"
+            if re.fullmatch(rf"{model.name}\.get_\w+", text_of(to)):
+                yield f"{text_of(to)} is replaced ({repo.at(place, to.lineno)})"
+    for attribute in reading.ACTIVATIONS:
+        if model.method(attribute):
+            yield f"its {attribute} is a method ({model.at(attribute)})"
+
+
+_OTHER_NUMBERS = re.compile(
+    r"(np|torch|F)\.(abs|clip|clamp|exp|round|sigmoid|sqrt|tanh)\(|\w*SH2RGB\(|"
+    r".+(\.(clip|clamp|half|round)\(|\[\W*\[\d| (\*\*|[*/@]) )"
+)
+"""Code that makes other numbers of what it takes."""
+
+
+def _stored(save: Function | None) -> list[ast.expr]:
+    """What a function puts side by side into the columns of a PLY."""
+    joined = (each for each in every(save, ast.Call) if text_of(each.func) == "np.concatenate")
+    given = [each.args[0] for each in joined if each.args]
+    return [each for whole in given for each in getattr(whole, "elts", ())]
 
 
 def _of_getters(model: ModelClass) -> Iterator[tuple[str, bool]]:
@@ -263,6 +302,11 @@ def _of_getters(model: ModelClass) -> Iterator[tuple[str, bool]]:
         model = ModelClass(model.repo)
     always = reading.computed_getters(model, reading.unset(model))
     options = reading.options(model, _training(model.repo))
+    home = reading.class_of(model)
+    bases = [text_of(each) for each in getattr(home, "bases", ())]
+    if {*bases} - {"object", "nn.Module", "torch.nn.Module"} and model.method("get_xyz"):
+        for kind in (kind for kind, getter in model.getters.items() if getter is None):
+            yield f"get_{kind} is that of {', '.join(bases)}, which was not read", False
     for kind in reading.computed_getters(model, options):
         if kind != "xyz" or "self.get_xyz" not in saved:
             yield f"get_{kind} is computed ({model.at(f'get_{kind}')})", kind not in always
@@ -290,6 +334,12 @@ def _of_scripts(model: ModelClass) -> Iterator[str]:
         yield _UNSAVED
     for script in scripts:
         yield from _of_sums(repo, script)
+        for each in every(repo.tree(script), ast.ClassDef):
+            own = {getattr(node, "name", "") for node in each.body}
+            changed = own & {"setup_functions", *(f"get_{kind}" for kind in reading.GETTERS)}
+            if changed and model.name in map(text_of, each.bases):
+                at = repo.at(script, each.lineno)
+                yield f"its PLY was not read: {each.name} changes {', '.join(changed)} ({at})"
     made = {each: name for each in scripts for name in reading.made_models(repo, each)}
     if made and model.method("get_xyz") and not repo.mentions(scripts, [model.name]):
         script, name = next(iter(made.items()))
@@ -301,6 +351,7 @@ def _of_sums(repo: HostRepo, script: str) -> Iterator[str]:
     tree = repo.tree(script)
     parts = ((to, made) for to, made in assigned(tree) if isinstance(made, ast.Subscript))
     drawn = {text_of(to) for to, made in parts if text_of(made.slice) == "'render'"}
+    drawn |= {text_of(e) for e in every(tree, ast.Subscript) if text_of(e.slice) == "'render'"}
     for node in every(tree, ast.BinOp):
         if isinstance(node.op, ast.Add):
             sides = [_terms(each) & drawn for each in (node.left, node.right)]
@@ -390,7 +441,8 @@ def _moved(repo: HostRepo, callers: HostRepo) -> Iterator[tuple[str, bool]]:
 def _drawing(repo: HostRepo, module: str) -> list[ast.FunctionDef]:
     """The functions of a module that draw, ``render`` first, then those that return a picture."""
     body = getattr(repo.tree(module), "body", ())
-    found = [each for each in body if isinstance(each, ast.FunctionDef) and _call(each)]
+    last = {each.name: each for each in body if isinstance(each, ast.FunctionDef)}
+    found = [each for each in last.values() if _call(each)]
     return sorted(found, key=lambda each: (each.name != "render", not pictures(each)))
 
 
@@ -417,7 +469,8 @@ def arguments(call: ast.AST | None) -> dict[str, ast.expr]:
 
 def pictures(function: ast.AST) -> list[ast.expr]:
     """What a function returns as ``render``."""
-    return reading.entries(function, "render")
+    later = (v for to, v in assigned(function) if text_of(getattr(to, "slice", None)) == "'render'")
+    return [*reading.entries(function, "render"), *later]
 
 
 def _shown(function: ast.AST) -> list[ast.AST]:
@@ -432,6 +485,13 @@ def _shown(function: ast.AST) -> list[ast.AST]:
         elif "means3D" not in arguments(each):
             found += ast.iter_child_nodes(each)
     return found
+
+
+def _cuts(node: ast.Subscript) -> bool:
+    """Whether code takes some or reorders some of what it reads, but for the first 3 channels."""
+    parts = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
+    cut = [each for each in parts if text_of(each) not in (":", ":3", "0:3")]
+    return any(isinstance(each, ast.Slice | ast.List) for each in cut)
 
 
 def _never_set(repo: HostRepo, value: str) -> bool:
@@ -466,6 +526,7 @@ class Drawing:
         given = zip(reversed(taken.args), reversed(taken.defaults), strict=False)
         self.switches = {a.arg for a, v in given if isinstance(getattr(v, "value", None), bool)}
         self.values: dict[str, list[ast.expr]] = {}
+        self.unasked = reading.skipped(function, reading.as_options(repo, ("arguments",)))
         read = (n for n in every(function, ast.Attribute) if n.attr.startswith("get_xyz"))
         models = [each.value.id for each in read if isinstance(each.value, ast.Name)]
         self.model = models[0] if models else "pc"
@@ -505,6 +566,9 @@ class Drawing:
                 if node.value:
                     self._assign(node.target, node.value)
                     self._join(before if isinstance(node, ast.AugAssign) else {})
+            elif isinstance(node, ast.Expr) and re.match(r"\w+\.\w+[^_]_\(", text_of(node)):
+                self._assign(node.value.func.value, node.value)  # type: ignore[attr-defined]
+                self._join(before)
             else:
                 for field in ("body", "body", "orelse", "finalbody"):  # a loop's, twice
                     self._collect(getattr(node, field, []))
@@ -599,6 +663,22 @@ class Drawing:
         blended = [each for each in names if _PICTURES.fullmatch(each)] or [*self._of_columns()]
         if blended:
             yield f"its rasterizer also takes {', '.join(blended)}", False
+        for each in calls:
+            own = self.repo.path(each.package) and not vendored(self.repo, each.package)
+            if own or each.package == "an unknown package":
+                yield f"its rasterizer is one of its own, which was not read ({each})", False
+            grounds = [e for e in self._roots(each.given.get("bg")) if f"{self.model}." in e]
+            if grounds:
+                yield f"its background is made of {', '.join(grounds)}", True
+        wraps = [text_of(each) for each in self.function.decorator_list]
+        wraps += [
+            text_of(value)
+            for module in (self.module, *_training(self.repo))
+            for to, value in assigned(self.repo.tree(module))
+            if text_of(to) == self.function.name and isinstance(value, ast.Call)
+        ]
+        for wrap in (each for each in wraps if not re.match(r"torch\.(no_grad|compile)", each)):
+            yield f"its {self.function.name} is wrapped by {wrap[:60]}", True
         for made in filter(None, map(self._made_into, pictures(self.function))):
             yield f"its picture is made into {text_of(made)[:60]} ({self._at(made)})", True
 
@@ -621,24 +701,52 @@ class Drawing:
         if others := [each for each in before if _OTHERS.search(each)]:
             yield f"its rasterizer returns another picture first, {others[0]}", False
 
-    def _made_into(self, value: ast.expr, seen: tuple[str, ...] = ()) -> ast.expr | None:
-        """The code that makes something else of the picture than its clamped numbers."""
-        whole = value
-        while isinstance(value, ast.Call) and _call(value) is None:
+    def _made_into(
+        self, value: ast.expr, seen: tuple[str, ...] = (), own: bool = False
+    ) -> ast.expr | None:
+        """The code that makes something else of the picture than its clamped numbers, or other
+        numbers of the model's ``own`` values.
+        """
+        whole, of_model = value, f"{self.model}."
+        while isinstance(value, ast.Call | ast.Subscript) and _call(value) is None:
+            if isinstance(value, ast.Subscript):
+                if isinstance(getattr(value.slice, "value", None), str):
+                    return None
+                if _cuts(value):
+                    return whole
+                value = value.value
+                continue
             method = value.func
+            named = text_of(method)
+            if own and (named.rpartition(".")[0] == self.model or named in _ACTIVATING):
+                return None
             if self._gives_back(getattr(method, "id", "")) and value.args:
                 value = value.args[0]
                 continue
-            if not isinstance(method, ast.Attribute) or method.attr not in _KEEPS:
+            if getattr(method, "attr", "") not in (_SAME if own else _KEEPS):
                 return None if text_of(method).startswith("bg_color.") else whole
-            value = value.args[0] if text_of(method.value) == "torch" else method.value
+            of: ast.expr = method.value  # type: ignore[attr-defined]
+            value = value.args[0] if text_of(of) == "torch" else of
+        if isinstance(value, ast.Compare | ast.UnaryOp):
+            return whole
         if isinstance(value, ast.BinOp):
             behind = isinstance(value.op, ast.Add) and _ADDED.search(text_of(value.right))
-            return self._made_into(value.left, seen) if behind else whole
+            return self._made_into(value.left, seen, own) if behind else whole
+        if seen and isinstance(value, ast.Constant) and value.value is not None:
+            return whole
+        if own and text_of(value) in (f"{of_model}_scaling", f"{of_model}_opacity"):
+            return whole
         name = getattr(value, "id", "")
         others = self.values.get(name, []) if name not in seen else []
-        made = (self._made_into(each, (*seen, name)) for each in others)
+        if own and self.call:  # what is neither of the model nor a number is unknown
+            before = [each for each in others if each.lineno <= self.call.lineno]
+            others = [e for e in before if isinstance(e, ast.Constant) or any(self._roots(e))]
+        made = (self._made_into(e, (*seen, name), own) for e in others if self._counts(e))
         return next((each for each in made if each is not None), None)
+
+    def _counts(self, value: ast.expr) -> bool:
+        """Whether a value is given by default."""
+        return value not in self.unasked
 
     def _gives_back(self, name: str) -> bool:
         """Whether a function returns first what its first argument is, or begins with."""
@@ -674,13 +782,23 @@ class Drawing:
     def shapes(self) -> Iterator[tuple[str, bool]]:
         """Likewise where its Gaussians are, and how large and opaque."""
         own = {"means3D": "get_xyz", "scales": "get_scaling", "rotations": "get_rotation"}
-        for argument in ("means3D", "opacities", "scales", "rotations"):
+        own["cov3D_precomp"] = "get_covariance"
+        for argument in ("means3D", "opacities", "scales", "rotations", "cov3D_precomp"):
             value = self.arguments.get(argument)
+            named = self.values.get(getattr(value, "id", ""), [])
+            if argument == "cov3D_precomp" and not any(map(self._counts, named)):
+                continue
             if others := self._others(value):
                 what = f"makes {argument} from {', '.join(others[:4])}, not from its PLY alone"
                 kept = f"{self.model}.{own.get(argument)}" in self._roots(value)
                 said = f"{self.function.name} {what} ({self._at(self.function)})"
                 yield said, kept and self._beside(others)
+                continue
+            roots = {*self._roots(value)} if value and not self.drawn_from else set()
+            alone = roots and all("." in each for each in roots)  # of the model's values
+            if alone and (made := self._made_into(value, own=True)):  # type: ignore[arg-type]
+                what = f"makes {argument} otherwise than its PLY has them, {text_of(made)[:60]}"
+                yield f"{self.function.name} {what} ({self._at(made)})", False
 
     def _others(self, *values: ast.expr | None) -> list[str]:
         """What values are made of that a plain drawing does not read, each once."""

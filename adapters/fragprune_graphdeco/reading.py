@@ -95,7 +95,8 @@ def computed_getters(model: ModelClass, unset: Collection[str] = ()) -> list[str
     found = []
     for kind, getter in model.getters.items():
         wanted = {"stored" if kind == "xyz" else "activated"}
-        if getter and returns(getter, f"_{kind}", unset) != wanted:
+        decorated = [text_of(each) for each in getter.decorator_list] if getter else []
+        if getter and ({*decorated} - {"property"} or returns(getter, f"_{kind}", unset) != wanted):
             found.append(kind)
     features = model.method("get_features")
     other = any(text_of(each.func) not in _JOINS for each in every(features, ast.Call))
@@ -256,8 +257,8 @@ def _left_out(repo: HostRepo, scripts: Iterable[str]) -> Iterator[str]:
             yield f"save_ply leaves out rows, {text_of(each)} ({repo.at(MODEL, each.lineno)})"
 
 
-_ROWS = re.compile(r"xyz|self\.(_|get_)xyz(\.\w+\(\))*")
-"""The positions of a model, in its save function."""
+_ROWS = re.compile(r"xyz|attributes|elements|self\.(_|get_)xyz(\.\w+\(\))*")
+"""The positions of a model, or all its values, in its save function."""
 
 
 def _drawn_elsewhere(repo: HostRepo, module: str) -> Iterator[str]:
@@ -276,7 +277,7 @@ def _drawn_elsewhere(repo: HostRepo, module: str) -> Iterator[str]:
                 alone = "GaussianRasteriz" not in text_of(other)
                 if alone and any(each not in given for each in shown):  # or it was drawn before
                     yield f"{name}, which calls no rasterizer of 3DGS"
-        for each in node.names if beside.startswith(f"{usual}.") else ():
+        for each in node.names if beside != usual else ():
             home, found = _definition(repo, beside, each.name)
             own = _definition(repo, usual, each.name)[0]
             if own and home != own and "GaussianRasterizer(" in text_of(found):
@@ -287,6 +288,11 @@ def _drawn_elsewhere(repo: HostRepo, module: str) -> Iterator[str]:
 def home_of(repo: HostRepo, module: str) -> str:
     """The module of the checkout that defines what a module calls GaussianModel; "" if unknown."""
     return _definition(repo, module, "GaussianModel")[0]
+
+
+def class_of(model: ModelClass) -> ast.stmt | None:
+    """The definition of a model's class."""
+    return _definition(model.repo, model.module, model.name)[1]
 
 
 def owners(tree: ast.AST | None) -> set[str]:

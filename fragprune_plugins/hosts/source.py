@@ -6,7 +6,7 @@ import ast
 import os
 import re
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from functools import cache, cached_property, lru_cache
 from importlib.metadata import distributions
 from importlib.util import find_spec
@@ -30,9 +30,9 @@ _FILE = UntrustedFile(
 
 def _definition(scope: ast.AST | None, name: str) -> ast.AST | None:
     """The class or function with a name, directly inside a module or class."""
-    body: Sequence[ast.stmt] = getattr(scope, "body", ())
-    kinds = (ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
-    return next((child for child in body if isinstance(child, kinds) and child.name == name), None)
+    named = [e for e in getattr(scope, "body", ()) if isinstance(e, ast.ClassDef | Function)]
+    own = [e for e in named if not any("setter" in ast.dump(d) for d in e.decorator_list)]
+    return next((e for e in reversed(own) if e.name == name), None)  # Python keeps the last
 
 
 _COMMIT = re.compile(r"[0-9a-f]{4,64}")

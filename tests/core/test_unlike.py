@@ -58,11 +58,20 @@ def test_the_drawn_picture_is_compared_with_the_photograph(tmp_path, written):
         ({"loss": "ssim(image * exposure, gt_image)"}, "image * exposure with gt_image"),
         ({"loss": "l1_loss(image * mask, gt_image * mask)"}, "image * mask with gt_image * mask"),
         ({"between": "gt_image = styled.pop(0)"}, "image with gt_image"),
+        ({"between": "gt_image = gt_image ** 2.2"}, "image with gt_image"),
+        ({"between": "image[:, seen] = 0"}, "image with gt_image"),
+        ({"between": "image.mul_(exposure(camera))"}, "image with gt_image"),
+        ({"loss": "l1_loss(blurred(image), gt_image)"}, "blurred(image) with gt_image"),
     ],
     ids=str,
 )
 def test_another_picture_is_compared(tmp_path, written, compared):
     assert why(tmp_path, **written).startswith(f"its training compares {compared} (train.py:")
+
+
+def test_a_mask_beside_the_comparison_leaves_parts_of_photographs_out(tmp_path):
+    found = why(tmp_path, loss="(torch.abs(image - gt_image) * static_mask).mean()")
+    assert found.startswith("its training weighs what it compares, static_mask (train.py:")
 
 
 @pytest.mark.parametrize(("default", "compared"), [("False", ""), ("True", "image with gt_image")])

@@ -283,6 +283,42 @@ def test_the_nearest_host_is_of_this_family(fork):
         ("shs=shs, scales", "mesh_color=mesh, shs=shs, scales", "rasterizer also takes mesh_color"),
         ("{'params': [], 'name': 'f_dc'}", "{'params': [self._opacity]}", "not train positions"),
         ("shs=shs, scales", "colors_precomp=torch.exp(rgb), shs=shs, scales", "torch.exp(rgb)"),
+        *(
+            (
+                "    opacity = pc.get_opacity\n",
+                f"    opacity = {made}\n",
+                "opacities otherwise than",
+            )
+            for made in (
+                "pc.get_opacity * 0.9",
+                "pc.get_opacity.clamp(max=0.5)",
+                "(pc.get_opacity > 0.5).float()",
+                "torch.tanh(pc._opacity)",
+                "pc.get_opacity\n    opacity[seen] = 0",
+                "pc.get_opacity\n    opacity.mul_(0.9)",
+            )
+        ),
+        ("pc.get_scaling, pc", "pc.get_scaling[:, :1].repeat(1, 3), pc", "scales otherwise than"),
+        (
+            "    @property\n    def get_xyz",
+            "    @property\n    @still\n    def get_xyz",
+            "get_xyz is",
+        ),
+        (
+            "    def construct",
+            "    @property\n    def get_scaling(self): return self.net(x)\n\n    def construct",
+            "get_scaling is computed",
+        ),
+        (
+            "        opacities = self._opacity",
+            "        opacities = 2 * self._opacity",
+            "other numbers",
+        ),
+        ("self._scaling.detach().cpu().numpy()", "np.exp(self._scaling)", "other numbers, scale"),
+        (CALLED, f"{CALLED}    image = image[:, 4:-4]\n", "is made into image[:, 4:-4]"),
+        (CALLED, f"{CALLED}    image.mul_(gain)\n", "is made into image.mul_(gain)"),
+        ("\n\ndef render", "\n\n@toned\ndef render", "render is wrapped by toned"),
+        ("return self._xyz\n", "return self._xyz\n\nGaussianModel.get_opacity = other\n", "is"),
         ("shs=shs, scales", "colors_precomp=pc.net(view), shs=shs, scales", "colours from pc.net"),
     ],
 )
@@ -296,7 +332,7 @@ def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):
 @pytest.mark.parametrize(
     ("old", "new"),
     [
-        ("means3D = pc.get_xyz", "means3D = moved(camera_pose, pc.get_xyz)"),
+        ("means3D = pc.get_xyz", "means3D = moved(viewpoint_camera.pose, pc.get_xyz)"),
         ('"opacity"]', '"opacity", "obj_dc_0"]'),
         ("= self._opacity.detach()", "= self.inverse_activation(self.get_opacity)"),
         ("        scale = self._sc", "        m = self.get_opacity > 0\n        scale = self._sc"),

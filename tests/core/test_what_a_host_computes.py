@@ -94,6 +94,20 @@ def test_sources_that_a_file_compiles_at_import_are_read_too(tmp_path, projectio
             "Gaussians widened by blur",
         ),
         ({"blend": f"{QUADRATIC} float alpha = c.w * exp(power);"}, "not capped at 0.99"),
+        ({"widened": "cov[0][0] += 0.3f; cov[1][1] += 0.1f;"}, "a low-pass filter of 0.1"),
+        *(
+            ({"blend": f"{EXPONENTIAL} {code}"}, says)
+            for code, says in (
+                ("if (alpha < 0.05f) continue;", "fragments fainter than 0.05"),
+                ("if (test_T < 0.01f) done = true;", "no light below 0.01"),
+                ("if (p_view.z <= 1.0f) return;", "Gaussians nearer than 1.0"),
+                ("r = ceil(2.f * sqrt(l));", "their deviation: 2."),
+                ("alpha = alpha * 0.5f;", "it blends otherwise, ;alpha=alpha*0.5;"),
+                ("float test_T = T * (1 - alpha * alpha);", "it blends otherwise, test_T="),
+                ("out_color[i] = C[ch] / (1.f - T);", "it blends otherwise, out_color[i]="),
+                ("vec3 computeColorFromSH(int i) { r += 0.5f; return r; }", "harmonics are r"),
+            )
+        ),
         (
             {"blend": "float own = min(0.99f, x); float alpha; alpha = a * own + b; alpha = own;"},
             "alpha = a*own+b: no exp()",
