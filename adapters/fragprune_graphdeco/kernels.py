@@ -27,7 +27,7 @@ _JACOBIAN = re.compile(r"\bJ\s*=\s*glm::mat3(?:x3)?\s*(\([^;]+\))\s*;")
 _FILTER = re.compile(r"\bcov(?:\[(?:0\]\[0|1\]\[1)\]|\.x|\.z)\s*\+=?\s*(?!cov\b)([\w.]+)")
 _NUMBERS = {
     "fragments fainter than": (r"\balpha<\(?([\d.]+(?:/[\d.]+)?)\)?", 1 / 255),
-    "no light below": (r"\btest_T<([\d.]+)\)", 1e-4),
+    "no light below": (r"\btest_T<([\d.]+)\)\{?done=true", 1e-4),
     "Gaussians nearer than": (r"\bp_view\.z<=?(0\.[2-9]\d*|[1-9][\d.]*)", 0.2),
     "Gaussians beyond this times their deviation:": (r"\bceil\(([\d.]+)\*sqrt\(", 3),
     "projections beyond this times the view:": (r"lim[xy]=([\d.]+)\*tan_fov", 1.3),
@@ -37,7 +37,7 @@ _COLOURS = re.compile(r"computeColorFromSH\([^;{]*\{(.*?)\breturn([^;]+);")
 _OF_COLOURS = r"max\(\w+,(vec3\()?0\.?0?\)?\)"
 _UNLIKE = re.compile(
     r"[;{})]((?:alpha|power)\*=[^;]+|(alpha|power)=\2\*[^;]+);|(SortPairsDescending)\(|"
-    r"test_T=(?!T\*\(1(?:\.0?)?-alpha\);)([^;]+);|C\[ch\]\+=([^;]+\*alpha);|"
+    r"test_T=(?!T\*\(1(?:\.0?)?-\w*alpha\);)([^;]+);|C\[ch\]\+=([^;]+\*alpha);|"
     r"out_color\[[^]]*\]=(C\[ch\]|[^;]*/[^;]*);"
 )
 """Code that blends otherwise."""
@@ -219,17 +219,28 @@ class _Project:
         for path, text in self.texts.items():
             normal = _normal(text)
             for what, (pattern, usual) in _NUMBERS.items():
-                for found in re.findall(pattern, normal):
-                    above, _, below = found.partition("/")
+                for match in re.finditer(pattern, normal):
+                    above, _, below = match[1].partition("/")
                     if not math.isclose(float(above) / float(below or 1), usual, rel_tol=0.01):
-                        yield self._finding(path, 0, f"{what} {found}", f"{usual:.4g}")
+                        at = self._place(path, match[0])
+                        yield self._finding(path, at, f"{what} {match[1]}", f"{usual:.4g}")
             for match in _UNLIKE.finditer(normal):
-                found = f"it blends otherwise, {_short(match[0])}"
-                yield self._finding(path, 0, found, "T (1 - alpha), front to back")
+                code = match[0].lstrip(";{})")
+                found, expected = (
+                    f"it blends otherwise, {_short(code)}",
+                    "T (1 - alpha), front to back",
+                )
+                yield self._finding(path, self._place(path, code), found, expected)
             for inside, given in _COLOURS.findall(normal):
                 if "+=0.5;" not in inside or not re.fullmatch(_OF_COLOURS, given):
                     found = f"colours of harmonics are {_short(given)}"
-                    yield self._finding(path, 0, found, "max(harmonics + 0.5, 0)")
+                    at = self._place(path, f"return{given}")
+                    yield self._finding(path, at, found, "max(harmonics + 0.5, 0)")
+
+    def _place(self, path: Path, code: str) -> int:
+        """Where the line begins that holds a statement in one spelling; 0 if it has several."""
+        lines = re.finditer(".+", self.texts[path])
+        return next((each.start() for each in lines if code in _normal(each[0])), 0)
 
     def _exponent(self, path: Path, position: int, text: str) -> str | None:
         """The exponent of an alpha, with the variables that it goes through; None without exp."""

@@ -52,10 +52,11 @@ def test_who_has_it_ignored_is_left_alone():
 
 
 CLOSED = """
-import sys, time
+import signal, sys, time
 from pathlib import Path
 from fragprune_plugins.learning.interruption import Terminate, sigterm_interrupts
 
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup it is inherited as ignored
 with sigterm_interrupts():
     try:
         print("ready", flush=True)

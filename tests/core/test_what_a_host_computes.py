@@ -102,7 +102,7 @@ def test_sources_that_a_file_compiles_at_import_are_read_too(tmp_path, projectio
                 ("if (test_T < 0.01f) done = true;", "no light below 0.01"),
                 ("if (p_view.z <= 1.0f) return;", "Gaussians nearer than 1.0"),
                 ("r = ceil(2.f * sqrt(l));", "their deviation: 2."),
-                ("alpha = alpha * 0.5f;", "it blends otherwise, ;alpha=alpha*0.5;"),
+                ("alpha = alpha * 0.5f;", "it blends otherwise, alpha=alpha*0.5;"),
                 ("float test_T = T * (1 - alpha * alpha);", "it blends otherwise, test_T="),
                 ("out_color[i] = C[ch] / (1.f - T);", "it blends otherwise, out_color[i]="),
                 ("vec3 computeColorFromSH(int i) { r += 0.5f; return r; }", "harmonics are r"),
@@ -125,6 +125,9 @@ def test_one_that_draws_by_another_is_refused_by_line(tmp_path, changed, says):
     [
         f"{QUADRATIC} const float g = __expf(power); const float alpha = fminf(0.99f, c.w * g);",
         f"{QUADRATIC} float alpha = 0.0f; {{ float alpha = min(0.99f, c.w * exp(power)); }}",
+        f"{EXPONENTIAL} float own_alpha = alpha; float test_T = T * (1 - own_alpha);",
+        f"{EXPONENTIAL} if (test_T < 0.0001f) {{ done = true; continue; }}",
+        f"{EXPONENTIAL} if (T > 0.5f && test_T < 0.5) median = depth;",
     ],
 )
 def test_the_rule_is_known_in_other_spellings(tmp_path, blend):
