@@ -36,9 +36,9 @@ _NUMBERS = {
 _COLOURS = re.compile(r"computeColorFromSH\([^;{]*\{(.*?)\breturn([^;]+);")
 _OF_COLOURS = r"max\(\w+,(vec3\()?0\.?0?\)?\)"
 _UNLIKE = re.compile(
-    r"[;{})]((?:alpha|power)\*=[^;]+|(alpha|power)=\2\*[^;]+);|(SortPairsDescending)\(|"
-    r"test_T=(?!T\*\(1(?:\.0?)?-\w*alpha\);)([^;]+);|C\[ch\]\+=([^;]+\*alpha);|"
-    r"out_color\[[^]]*\]=(C\[ch\]|[^;]*/[^;]*);"
+    r"[;{})](?:(?:alpha|power)\*=[^;]+|(alpha|power)=\1\*[^;]+);|SortPairsDescending\(|"
+    r"test_T=(?!T\*\(1(?:\.0?)?-\w*alpha\);)[^;]+;|C\[ch\]\+=[^;]+\*alpha;|"
+    r"out_color\[[^]]*\]=(?:C\[ch\]|[^;]*/[^;]*);"
 )
 """Code that blends otherwise."""
 _EWA = re.compile(  # the third row is of depth: no picture has it
@@ -226,11 +226,9 @@ class _Project:
                         yield self._finding(path, at, f"{what} {match[1]}", f"{usual:.4g}")
             for match in _UNLIKE.finditer(normal):
                 code = match[0].lstrip(";{})")
-                found, expected = (
-                    f"it blends otherwise, {_short(code)}",
-                    "T (1 - alpha), front to back",
-                )
-                yield self._finding(path, self._place(path, code), found, expected)
+                found = f"it blends otherwise, {_short(code)}"
+                at = self._place(path, code)
+                yield self._finding(path, at, found, "T (1 - alpha), front to back")
             for inside, given in _COLOURS.findall(normal):
                 if "+=0.5;" not in inside or not re.fullmatch(_OF_COLOURS, given):
                     found = f"colours of harmonics are {_short(given)}"

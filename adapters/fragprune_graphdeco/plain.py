@@ -106,6 +106,7 @@ def read_plain(repo: HostRepo) -> Plain:
         *(() if flat else _of_kernel(repo)),
         *drawn,
         *_of_saving(model),
+        *_of_activations(model),
         *_of_positions(model),
         *_of_others(model),
         *_of_scripts(model),
@@ -180,7 +181,7 @@ def _of_others(model: ModelClass) -> Iterator[str]:
                 what, at = f"{each}, {says}" if says else each, other.at(_LISTS)
                 yield f"{trained} its PLY also holds {what} ({at})"
         if whole:
-            for reason in (*_of_saving(other), *dict(_of_getters(other))):
+            for reason in (*_of_saving(other), *_of_activations(other), *dict(_of_getters(other))):
                 yield f"{trained} {reason}"
 
 
@@ -235,17 +236,13 @@ def _scales(model: ModelClass) -> Iterator[str]:
 
 def _of_saving(model: ModelClass) -> Iterator[str]:
     """Values that are not saved as they are before activation."""
-    raw, repo, module = {"scaling": True, "opacity": True}, model.repo, model.module
-    for node in every(model.method("save_ply"), ast.Assign):
-        if not isinstance(node.targets[0], ast.Name):
-            continue
-        target, value = node.targets[0].id, text_of(node.value)
+    repo, module = model.repo, model.module
+    for node in _assigned_names(model.method("save_ply")):
+        target, value = text_of(node.targets[0]), text_of(node.value)
         shown = f"{value[:60]} ({repo.at(module, node.lineno)})"
-        for kind in raw:
-            if re.search(rf"self\.get_{kind}\b", value) and not isinstance(node.value, ast.Compare):
-                raw[kind] = False
-                if not re.search(r"inverse|log", value):
-                    yield f"save_ply stores activated values, {target} = {shown}"
+        taken = any(_takes(node, kind) for kind in ("scaling", "opacity"))
+        if taken and not re.search(r"inverse|log", value):
+            yield f"save_ply stores activated values, {target} = {shown}"
         if target in ("opacities", "scale") and (got := re.match(r"self\.(get_\w+_\w+)", value)):
             getter, stored = model.method(got[1]), "_scaling" if target == "scale" else "_opacity"
             if getter is None or reading.returns(getter, stored) != {"stored"}:
@@ -261,6 +258,26 @@ def _of_saving(model: ModelClass) -> Iterator[str]:
         if _OTHER_NUMBERS.match(text_of(each)):
             shown = f"{text_of(each)[:60]} ({repo.at(module, each.lineno)})"
             yield f"save_ply stores other numbers, {shown}"
+
+
+def _assigned_names(save: Function | None) -> list[ast.Assign]:
+    """What a function assigns to variables."""
+    return [each for each in every(save, ast.Assign) if isinstance(each.targets[0], ast.Name)]
+
+
+def _takes(node: ast.Assign, kind: str) -> bool:
+    """Whether a value is made of what a getter activates, and not only compared with it."""
+    found = re.search(rf"self\.get_{kind}\b", text_of(node.value))
+    return bool(found) and not isinstance(node.value, ast.Compare)
+
+
+def _of_activations(model: ModelClass) -> Iterator[str]:
+    """Other activations than those of 3DGS, wherever they are set, and getters that are replaced.
+
+    What is saved activated needs none.
+    """
+    repo, module = model.repo, model.module
+    saved = _assigned_names(model.method("save_ply"))
     text = "".join([text_of(repo.tree(module)), *_scripts(repo).values()])
     functions = every(repo.tree(module), ast.FunctionDef)
     used = ("__init__", "setup_functions")
@@ -272,7 +289,8 @@ def _of_saving(model: ModelClass) -> Iterator[str]:
         for to, made in assigned(part):
             attribute, value = getattr(to, "attr", ""), text_of(made)
             expected = reading.ACTIVATIONS.get(attribute, (value,))
-            if value not in expected and raw.get(attribute.removesuffix("_activation"), True):
+            kind = attribute.removesuffix("_activation")
+            if value not in expected and not any(_takes(each, kind) for each in saved):
                 yield f"its {attribute} is {value[:50]} ({repo.at(place, to.lineno)})"
             if re.fullmatch(rf"{model.name}\.get_\w+", text_of(to)):
                 yield f"{text_of(to)} is replaced ({repo.at(place, to.lineno)})"
@@ -670,17 +688,21 @@ class Drawing:
             grounds = [e for e in self._roots(each.given.get("bg")) if f"{self.model}." in e]
             if grounds:
                 yield f"its background is made of {', '.join(grounds)}", True
-        wraps = [text_of(each) for each in self.function.decorator_list]
-        wraps += [
-            text_of(value)
-            for module in (self.module, *_training(self.repo))
-            for to, value in assigned(self.repo.tree(module))
-            if text_of(to) == self.function.name and isinstance(value, ast.Call)
-        ]
-        for wrap in (each for each in wraps if not re.match(r"torch\.(no_grad|compile)", each)):
+        for wrap in self._wraps():
             yield f"its {self.function.name} is wrapped by {wrap[:60]}", True
         for made in filter(None, map(self._made_into, pictures(self.function))):
             yield f"its picture is made into {text_of(made)[:60]} ({self._at(made)})", True
+
+    def _wraps(self) -> Iterator[str]:
+        """What decorates the function, or takes it and is then called by its name."""
+        name, found = self.function.name, list(map(text_of, self.function.decorator_list))
+        for module in (self.module, *_training(self.repo)):
+            for node in getattr(self.repo.tree(module), "body", ()):
+                again = isinstance(node, ast.Assign) and text_of(node.targets[0]) == name
+                if again and name in map(text_of, getattr(node.value, "args", ())):
+                    found.append(text_of(node.value))
+        harmless = r"torch\.(no_grad|compile)|(functools\.)?partial\("
+        yield from (each for each in found if not re.match(harmless, each))
 
     def _of_columns(self) -> Iterator[str]:
         """Arguments that further columns of the PLY may be, without channels beside the colours."""

@@ -228,7 +228,7 @@ class HostRepo:
                 seen.setdefault(name, f"{module}:{lines[name]}")
         return seen
 
-    @property
+    @cached_property
     def imported(self) -> set[str]:
         """Top-level packages that scripts right in the folder import."""
         scripts = self.root.glob("*.py")

@@ -35,7 +35,7 @@ def sigterm_interrupts() -> Iterator[None]:
         yield
         return
     process, unraisable = os.getpid(), sys.unraisablehook
-    hang_up = signal.getsignal(signal.SIGHUP) or signal.SIG_DFL
+    hangs_up = hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_DFL
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         if os.getpid() != process:  # a worker that was forked off: it has nothing to save
@@ -47,7 +47,7 @@ def sigterm_interrupts() -> Iterator[None]:
         signal.signal(number, signal.SIG_IGN)
         nowhere = os.open(os.devnull, os.O_WRONLY)
         for output in (1, 2):
-            if not Path(f"/dev/fd/{output}").is_file():  # what was a terminal refuses to be written
+            if not Path(f"/dev/fd/{output}").is_file():  # a terminal that is gone takes none
                 os.dup2(nowhere, output)
         signal.raise_signal(signal.SIGTERM)
 
@@ -61,7 +61,8 @@ def sigterm_interrupts() -> Iterator[None]:
         again.start()
 
     signal.signal(signal.SIGTERM, interrupt)
-    signal.signal(signal.SIGHUP, hung_up if hang_up is signal.SIG_DFL else hang_up)
+    if hangs_up:
+        signal.signal(signal.SIGHUP, hung_up)
     sys.unraisablehook = dropped
     try:
         yield
@@ -69,4 +70,5 @@ def sigterm_interrupts() -> Iterator[None]:
         if sys.unraisablehook is dropped:
             sys.unraisablehook = unraisable
         signal.signal(signal.SIGTERM, before)
-        signal.signal(signal.SIGHUP, hang_up)
+        if hangs_up:
+            signal.signal(signal.SIGHUP, signal.SIG_DFL)

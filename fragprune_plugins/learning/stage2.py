@@ -114,7 +114,7 @@ class Stage2:
         self.parameters = parameters
         self.picture = ""  # the view's name, for messages; drivers set it before they draw
         self._open = False  # the warm-up is over
-        self._felt = False  # what is drawn now has a gradient in the thresholds
+        self._differentiable = False  # what is drawn now has a gradient in the thresholds
         self._held = False  # thresholds have met their target and stay
         # by picture: fragments per pixel
         self._before: dict[_Picture, Tensor] = {}
@@ -194,7 +194,7 @@ class Stage2:
         if not self.settings.goal.learns:
             return None
         values = self._truncate(inputs, self.store)
-        self._felt = values is not None and values.requires_grad
+        self._differentiable = values is not None and values.requires_grad
         if values is None or self.plan is None or self.learning:
             return values
         return values.detach()
@@ -254,7 +254,7 @@ class Stage2:
         self._views.draw(drawn[0], self._before[picture][0], pressed.detach())
         if not self.learning or self.pressure.value == 0:
             return None
-        if self._felt and not (pressed.requires_grad and outputs.image.requires_grad):
+        if self._differentiable and not (pressed.requires_grad and outputs.image.requires_grad):
             found = "a picture, or fragments per pixel, without a gradient"
             remedy = "Choose another --engine: this one cannot learn."
             raise EngineError("the engine", found, "both with respect to thresholds", remedy)

@@ -92,6 +92,13 @@ def test_who_has_a_closed_terminal_ignored_is_left_alone():
         signal.signal(signal.SIGHUP, before)
 
 
+def test_where_no_terminal_hangs_up_there_is_sigterm_alone(monkeypatch):
+    """As on Windows."""
+    monkeypatch.delattr(signal, "SIGHUP")
+    with pytest.raises(Terminate), sigterm_interrupts():
+        signal.raise_signal(signal.SIGTERM)
+
+
 @pytest.mark.parametrize("guarded", [sigterm_interrupts, between_steps])
 def test_another_thread_than_the_main_one_changes_nothing(guarded):
     seen = []

@@ -35,6 +35,7 @@ def why(root, drawn=DRAWN, between="pass", loss=LOSS):
         {},
         {"drawn": 'image, seen = package["render"], package["radii"]'},
         {"loss": "torch.abs(image - gt_image).mean()"},
+        {"loss": "config.lambda_l1 * l1_loss(image, gt_image)"},
         {"loss": "F.mse_loss(torch.clamp(image, 0, 1).unsqueeze(0), gt_image.unsqueeze(0))"},
         {"loss": f"{LOSS} + l1_loss(depth, viewpoint_cam.invdepthmap)"},
         {"loss": f"{LOSS} + l1_loss(package['app_image'], gt_image)"},

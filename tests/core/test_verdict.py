@@ -302,7 +302,7 @@ def test_the_nearest_host_is_of_this_family(fork):
         (
             "    @property\n    def get_xyz",
             "    @property\n    @still\n    def get_xyz",
-            "get_xyz is",
+            "get_xyz is computed",
         ),
         (
             "    def construct",
@@ -318,7 +318,12 @@ def test_the_nearest_host_is_of_this_family(fork):
         (CALLED, f"{CALLED}    image = image[:, 4:-4]\n", "is made into image[:, 4:-4]"),
         (CALLED, f"{CALLED}    image.mul_(gain)\n", "is made into image.mul_(gain)"),
         ("\n\ndef render", "\n\n@toned\ndef render", "render is wrapped by toned"),
-        ("return self._xyz\n", "return self._xyz\n\nGaussianModel.get_opacity = other\n", "is"),
+        ("\n\ndef render", "\n\nrender = toned(render)\n\n\ndef render", "by toned(render)"),
+        (
+            "        scale = self._scaling.detach().cpu().numpy()\n",
+            "        ...\n\n\nGaussianModel.get_opacity = other\n",
+            "GaussianModel.get_opacity is replaced",
+        ),
         ("shs=shs, scales", "colors_precomp=pc.net(view), shs=shs, scales", "colours from pc.net"),
     ],
 )
@@ -343,6 +348,8 @@ def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):
         ("    means3D = pc.get_xyz\n", "    means3D = pc.net(t)\n    means3D = pc.get_xyz\n"),
         (CALLED, f"{CALLED}    opacity = pc.net(image)\n"),
         (CALLED, f"{CALLED}    image = image[:3]\n"),
+        ("\n\ndef render", "\n\ndef l1(render):\n    render = clamp(render)\n\n\ndef render"),
+        ("\n\ndef render", "\n\nrender = partial(render, pipe=None)\n\n\ndef render"),
         ("means3D=means3D, opacities=opacity, shs=shs,", "means3D, None, opacity, shs,"),
         (CALLED, CLAMPED),
         (END, EXPOSED),

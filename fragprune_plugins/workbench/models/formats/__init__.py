@@ -118,10 +118,8 @@ def read(path: Path, *, filtered: bool = False) -> Model:
     with _FILE.reading(path) as reading:
         model = form.read(reading)
         if not hasattr(model, "xyz"):
-            given, remedy = (
-                f"{type(model).__name__} from {path}",
-                "Update or uninstall its package.",
-            )
+            given = f"{type(model).__name__} from {path}"
+            remedy = "Update or uninstall its package."
             raise PluginError(f"format {form.name}", given, "a Model", remedy)
         expect_drawable(path, model)
         return model
