@@ -15,7 +15,7 @@ from pathlib import Path
 
 from fragprune_graphdeco import reading
 from fragprune_graphdeco.call import ARGUMENTS, RASTERIZER, read_calls
-from fragprune_graphdeco.kernels import ORDER, SPLAT, read_kernels, vendored
+from fragprune_graphdeco.kernels import ORDER, SPLAT, read_kernels
 from fragprune_graphdeco.photographs import unlike
 from fragprune_graphdeco.reading import ModelClass, assigned, every, first_of, passed, text_of
 from fragprune_plugins.adapting import (
@@ -682,9 +682,8 @@ class Drawing:
         if blended:
             yield f"its rasterizer also takes {', '.join(blended)}", False
         for each in calls:
-            own = self.repo.path(each.package) and not vendored(self.repo, each.package)
-            if own or each.package == "an unknown package":
-                yield f"its rasterizer is one of its own, which was not read ({each})", False
+            if each.package == "an unknown package":
+                yield f"its rasterizer was not read ({each})", False
             grounds = [e for e in self._roots(each.given.get("bg")) if f"{self.model}." in e]
             if grounds:
                 yield f"its background is made of {', '.join(grounds)}", True

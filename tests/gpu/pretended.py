@@ -204,6 +204,18 @@ def a_gpu() -> Iterator[None]:
         yield
 
 
+@contextmanager
+def leaving() -> Iterator[None]:
+    """End the process at once if all went well: torch's thread of a device may outlive Python."""
+    try:
+        yield
+    except SystemExit as end:
+        if end.code:
+            raise
+    sys.stdout.flush()
+    os._exit(0)
+
+
 def main() -> None:
     """The command, on this GPU."""
     from fragprune_plugins.workbench.commands import main as fragprune

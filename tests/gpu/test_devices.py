@@ -34,7 +34,8 @@ def python(device):
     """Runs a program that has imported the pretended GPU; its words follow."""
 
     def run(text: str, *words: object, where: Path) -> str:
-        program = ["-c", f"from gpu import pretended\n{text}", str(device.folder)]
+        inside = f"from gpu import pretended\nwith pretended.leaving(): exec({text!r})"
+        program = ["-c", inside, str(device.folder)]
         command = [sys.executable, *program, *map(str, words)]
         paths = {"PYTHONPATH": os.pathsep.join(sys.path)}
         done = subprocess.run(
