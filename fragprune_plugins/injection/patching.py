@@ -134,7 +134,7 @@ class PatchLedger:
         ]
         if holders:
             found = f"already imported, and bound by name in {', '.join(sorted(holders))}"
-            remedy = "Start the host with fragprune run, or call activate() above those imports."
+            remedy = "Use fragprune run, or activate() above those imports (restart notebooks)."
             raise LateImportError(str(seam), found, "activation before the host's imports", remedy)
 
 
