@@ -416,7 +416,7 @@ class ForkAdapter(GraphdecoAdapter):
             if any(value != fork.default(name) for value in values):
                 raise UsageError(
                     f"--{name}",
-                    "other draws, other values of the rasterizer, or other changes of the model",
+                    "other draws, values of the rasterizer, changes of the model, or options",
                     f"what was read of {', '.join(fork.scripts)}, without it",
                     "Leave it out, or prune its PLY: fragprune finetune.",
                 )

@@ -85,7 +85,8 @@ class Fork:
     setups: tuple[str, ...] = ()  # methods that make the optimizer
     # by package, the argument with channels that are blended beside the colours
     blended: dict[str, str] = field(default_factory=dict)
-    # off by default: scripts then draw by other functions, change the model, or read unknown values
+    # off by default: scripts then draw by other functions, change the model, read unknown values,
+    # or take the other options from a file
     options: frozenset[str] = frozenset()
     off: frozenset[str] = frozenset()  # what rasterizers take that is None or False by default
     scaled: frozenset[str] = frozenset()  # settings that change the gradient on the screen alone
@@ -220,6 +221,7 @@ def _read_scripts(fork: Fork, scripts: tuple[str, ...]) -> None:
         made = [each for each in reading.made_models(repo, module) if each not in networks]
         if CLASS in made and len(set(made)) == 1:
             fork.scripts += (script,)
+            fork.options |= reading.overruling(repo, module)
             for found in reading.failing(repo, (script,)):
                 fork.refuse("script", script, found, "a script that runs")
             if len(made) > 1 or _in_loop(fork.tree(script), CLASS):

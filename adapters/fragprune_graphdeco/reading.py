@@ -7,7 +7,7 @@ import contextlib
 import operator
 import re
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -193,7 +193,7 @@ def failing(repo: HostRepo, scripts: tuple[str, ...]) -> tuple[str, ...]:
             if any("torch.compile" in text_of(each) for each in node.decorator_list):
                 found.append(f"{script} compiles {node.name}, which trains")
         found += [*_broken(repo, module)][:1]
-        found += (*_misfits(repo, module), *_absent(repo, module), *_own_folders(repo, module))[:1]
+        found += (*_misfits(repo, module), *_absent(repo, module), *_own_options(repo, module))[:1]
         found += [f"{script} draws by {each}" for each in _drawn_elsewhere(repo, module)][:1]
     return tuple(found)
 
@@ -339,23 +339,54 @@ def _misfits(repo: HostRepo, module: str) -> tuple[str, ...]:
     return misfits
 
 
-def _own_folders(repo: HostRepo, module: str) -> Iterator[str]:
-    """Folders of data and output, or all options, that a script sets whatever its command says."""
-    body = getattr(repo.tree(module), "body", ())
+_OURS = ("source_path", "model_path", "iterations", "checkpoint_iterations", "start_checkpoint")
+"""Options of a command that a run, or whoever starts it, relies on."""
+
+
+def _own_options(repo: HostRepo, module: str) -> Iterator[str]:
+    """Options that a script sets whatever its command says: one of ours, or all that a file has."""
+    tree = repo.tree(module)
+    body = getattr(tree, "body", ())
     asked = [node for node in body if isinstance(node, ast.If)]
     main = [each for node in asked if "__name__" in text_of(node.test) for each in node.body]
     known = as_options(repo, ("arguments", module))
-    for node in (each for each in (*body, *main) if isinstance(each, ast.Assign)):
-        name, at = getattr(node.targets[0], "attr", ""), repo.at(module, node.lineno)
-        if name in ("source_path", "model_path") and f".{name}" not in text_of(node.value):
+    for node in (*body, *main):
+        at = repo.at(module, node.lineno)
+        if isinstance(node, ast.For) and _sets_any(node, skipped(tree, known)):
+            yield f"sets options by {text_of(node.iter)}, whatever its command says ({at})"
+        if not isinstance(node, ast.Assign):
+            continue
+        name = getattr(node.targets[0], "attr", "")
+        if name in _OURS and f".{name}" not in text_of(node.value):
             yield f"sets {name} itself, whatever its command says ({at})"
         called = getattr(getattr(node.value, "func", None), "id", "")
         made = _definition(repo, module, called)[1]
-        if not isinstance(made, ast.FunctionDef):
-            continue
-        done = {*every(made, ast.Call)} - skipped(made, known).keys()
-        if any(text_of(each.func) == "setattr" for each in done):
+        if isinstance(made, ast.FunctionDef) and _sets_any(made, skipped(made, known)):
             yield f"sets options by {called}, whatever its command says ({at})"
+
+
+def overruling(repo: HostRepo, module: str) -> frozenset[str]:
+    """Options, off by default, under which a script sets others whatever its command says."""
+    tree, known = repo.tree(module), as_options(repo, ("arguments", module))
+    imports = every(tree, ast.ImportFrom)
+    homes = {each.name: repo.absolute(module, node) for node in imports for each in node.names}
+    found = frozenset[str]()
+    for node, test in skipped(tree, known).items():
+        name = getattr(getattr(node, "func", None), "id", "")
+        made = repo.function(homes.get(name, module), name) if name else None
+        if name == "setattr" or (made and _sets_any(made, {})):
+            found |= options_of(test, known)
+    return found
+
+
+def _sets_any(tree: ast.AST, gone: Mapping[ast.AST, ast.expr]) -> bool:
+    """Whether code sets attributes by the names that it reads, or returns a namespace of them."""
+    calls = {*every(tree, ast.Call)} - gone.keys()
+    returned = [each.value for each in every(tree, ast.Return)]
+    return any(
+        text_of(each.func) == "setattr" or (each in returned and "Namespace(**" in text_of(each))
+        for each in calls
+    )
 
 
 _ANY = "any key"

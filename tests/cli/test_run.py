@@ -166,6 +166,22 @@ def test_what_a_host_that_tidies_up_takes_away_is_missed(scene, tmp_path, files,
     fails("run", *WORDS, *words, says=said, code=1)
 
 
+@pytest.mark.parametrize("last", [10, 14])
+def test_a_stage_two_that_a_host_cuts_short_is_told(scene, tmp_path, last, caplog):
+    host = shutil.copytree(HOST, tmp_path / "host")
+    text = (host / "train.py").read_text()
+    cut = text.replace("opt.iterations + 1", f"min(opt.iterations, {last}) + 1")
+    assert cut != text
+    (host / "train.py").write_text(cut)
+    words = command(scene, tmp_path / "out")
+    words[1] = host / "train.py"
+    if last == 10:
+        fails("run", *WORDS, *words, says="0 of 6 iterations", code=1)
+    else:
+        run("run", *WORDS, *words)
+        assert "ended after 4 of 6 iterations" in caplog.text
+
+
 @pytest.mark.parametrize("held", [True, False])
 def test_views_that_stage_one_saw_are_not_said_to_be_held_out(scene, tmp_path, held):
     out = tmp_path / "out"

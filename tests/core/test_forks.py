@@ -601,21 +601,42 @@ OVERRULES = {
     "a folder by a name of its own": ("args.model_path = os.path.join('out', now())", False),
     "the same, whole": ("args.source_path = os.path.abspath(args.source_path)", True),
     "another option": ("args.images = 'images_4'", True),
+    "the length": ("args.iterations = 7000", False),
+    "more to save": ("args.checkpoint_iterations = args.checkpoint_iterations + [7]", True),
+    "options of a file, one by one": (
+        "for key, value in read(args).items():\n        setattr(args, key, value)",
+        False,
+    ),
+    "those of a file before the command's": ("args = merged(args, read(args))", False),
     "options of a file": ("args = overruled(args, read(args.config))", False),
     "options of a file that is named": ("args = asked(args, read)", True),
     "where none is given": ("if not args.model_path:\n        args.model_path = 'out'", True),
 }
 
 
-@pytest.mark.parametrize("what", OVERRULES)
-def test_a_script_that_overrules_the_folders_of_its_command_is_refused(tmp_path, what):
-    sets, served = OVERRULES[what]
+def overruled(tmp_path, sets):
     rules = "\n\ndef overruled(args, options):\n    setattr(args, *options)\n    return args\n"
+    rules += "\n\ndef merged(args, read):\n    return Namespace(**(vars(args) | read))\n"
     rules += "\n\nparser.add_argument('--config', default='')\n\n\ndef asked(args, read):\n"
     rules += "    if args.config:\n        setattr(args, *read(args.config))\n    return args\n"
     main = f"{rules}\nif __name__ == '__main__':\n    {sets}\n{PARSES}"
-    found = errors(fork(tmp_path, (PARSES, main)))
+    return fork(tmp_path, (PARSES, main))
+
+
+@pytest.mark.parametrize("what", OVERRULES)
+def test_a_script_that_overrules_its_command_is_refused(tmp_path, what):
+    sets, served = OVERRULES[what]
+    found = errors(overruled(tmp_path, sets))
     assert found == [] if served else "whatever its command says" in found[0]
+
+
+def test_a_command_that_names_a_file_which_overrules_it_is_refused(tmp_path):
+    by_merge = "if args.config:\n        args = overruled(args, read(args.config))"
+    for each, sets in enumerate(("args = asked(args, read)", by_merge)):
+        repo = overruled(tmp_path / str(each), sets)
+        ForkAdapter().refuse(repo, ["--iterations", "9"], stage="auto", device="cpu")
+        with pytest.raises(UsageError, match="--config"):
+            ForkAdapter().refuse(repo, ["--config", "a.json"], stage="auto", device="cpu")
 
 
 MOVED = [

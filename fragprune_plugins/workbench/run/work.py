@@ -22,6 +22,7 @@ from torch import Tensor
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import (
     FragpruneError,
+    HostFailed,
     NotComparedError,
     SidecarError,
     UnknownHostError,
@@ -93,6 +94,7 @@ def run(
             summary = _launched(host_command, options)
         if isinstance(summary, Unserved):
             return train_then_finetune(summary, stage, settings, engine, again=again, json=as_json)
+        _expect_steps(summary, options)
         _expect_thresholds(summary, settings)
         photographs = photographs_of(summary)
         not_compared = _not_compared(summary)
@@ -143,6 +145,22 @@ def _not_compared(summary: launch.RunSummary) -> FragpruneError | None:
     where, found = "the host's command", "no --eval: every view is trained on"
     remedy = "Train with --eval, from stage 1 on."
     return NotComparedError(where, found, "views that are held out", remedy)
+
+
+def _expect_steps(summary: launch.RunSummary, options: launch.RunOptions) -> None:
+    """Refuse a stage 2 that took no step, and warn of one that ended before its last."""
+    wanted = summary.settings["iterations"]
+    apart = options.stage in ("auto", "finetune") and options.from_iter is None
+    begun = (summary.model_before or summary.steps) and not summary.already_finished
+    if not (apart and begun) or summary.steps >= wanted:
+        return
+    found = f"stage 2 ended after {summary.steps} of {wanted} iterations"
+    expected = "the length that its command says, whatever a file of options says"
+    remedy = "Take the length out of that file; or prune the trained PLY: fragprune finetune."
+    error = HostFailed(f"{summary.adapter}'s script", found, expected, remedy)
+    if not summary.steps:
+        raise error
+    log.warning("%s", error)
 
 
 def _expect_thresholds(summary: launch.RunSummary, settings: Settings) -> None:
