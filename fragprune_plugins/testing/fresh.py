@@ -56,6 +56,7 @@ def fresh(function: Callable[..., Any], *arguments: Any, seconds: float = 240.0)
     theirs.close()
     try:
         if not ours.poll(seconds):
+            process.kill()
             raise FreshProcessError(f"took longer than {seconds:g} seconds")
         kind, value = ours.recv()
     except EOFError:

@@ -15,26 +15,21 @@ sys.path.insert(0, host)
 words = ["--iterations", "4", "--save_iterations", "4", "--test_iterations", "-1"]
 command = [host + "/train.py", "-s", scene, "-m", out, *words]
 summary = run(command, RunOptions(device="cpu", settings=Settings(iterations=4)))
-ours = [name for name in sys.modules if name.startswith("fragprune_plugins.workbench")]
-print(json.dumps([ours, sorted(sys.modules), summary.steps]))
+first = list(sys.modules)
+import fragprune_plugins.workbench.run.work
+print(json.dumps([first, list(sys.modules), summary.steps]))
 """
 
 
+START = "fragprune_plugins.workbench."
+
+
 def test_a_host_run_loads_no_module_of_the_workbench(tmp_path, photographs, python):
-    ours, loaded, steps = python(PROGRAM, HOST, photographs, tmp_path / "out")
+    """And the command of it what measures and tries, and finetune: it may follow a host alone."""
+    trained, commanded, steps = python(PROGRAM, HOST, photographs, tmp_path / "out")
     assert steps == 4
-    assert ours == []
-    assert not [name for name in OTHERS if name in loaded]
-
-
-def test_the_command_run_loads_of_the_workbench_what_measures_and_tries(python):
-    """Of the slices its own, and finetune: tried before stage 2, or what follows a host alone."""
-    ours = python(
-        "import json, sys\n"
-        "import fragprune_plugins.workbench.run.work\n"
-        "start = 'fragprune_plugins.workbench.'\n"
-        "names = {m[len(start):].split('.')[0] for m in sys.modules if m.startswith(start)}\n"
-        "print(json.dumps(sorted(names)))"
-    )
+    assert not [name for name in trained if name.startswith(START[:-1])]
+    assert not [name for name in OTHERS if name in trained]
+    ours = {name.split(".")[2] for name in commanded if name.startswith(START)}
     measures = {"run", "commands", "figures", "goals", "models", "scenes", "ranks"}
-    assert set(ours) <= measures | {"finetune", "pruning", "distributed", "saved"}
+    assert ours <= measures | {"finetune", "pruning", "distributed", "saved"}

@@ -206,7 +206,7 @@ def test_a_log_is_of_a_single_training(tmp_path):
         ([HOST / "render.py", "-m", "out"], True),
         (["-u", HOST / "train.py"], True),
         (["-c", "print(1)"], False),
-        (["-m", "json.tool"], False),
+        (["-m", "tqdm"], False),
         (["nothere.py"], False),
         ([], False),
     ],

@@ -1,9 +1,13 @@
 """One line in a fork, in a process of its own."""
 
+import sys
+from types import ModuleType
+
 import pytest
 from miniatures.runs import written
 
 from fragprune_plugins.testing import Host
+from fragprune_plugins.testing.fresh import fresh
 
 
 @pytest.fixture
@@ -16,7 +20,7 @@ def fork(tmp_path):
 
 
 SCRIPT = """
-import json, sys
+import sys
 sys.argv[0] = sys.argv[1] + "/train.py"
 sys.path.insert(0, sys.argv[1])
 import fragprune_plugins
@@ -72,20 +76,30 @@ try:  # below the imports
 except LateImportError as error:
     seen["late"] = "__main__" in error.found
 seen["untouched"] = gaussian_renderer.render is render
-print(json.dumps(seen))
+"""
+SHELL = """
+import os, sys
+import fragprune_plugins
+os.chdir(sys.argv[1])
+sys.ps1, sys.argv[0] = "> ", sys.argv[2]
+seen = fragprune_plugins.activate().adapter.name
 """
 
 
+def main(code, *words):
+    """What a program has seen, whose module has no file."""
+    sys.argv, sys.modules["__main__"] = ["-c", *words], ModuleType("__main__")
+    exec(code, vars(sys.modules["__main__"]))
+    return sys.modules["__main__"].seen
+
+
 @pytest.mark.parametrize("launcher", ["", "/usr/lib/ipykernel_launcher.py"])
-def test_a_shell_finds_the_host_in_the_current_folder(fork, python, launcher):
-    code = f"import sys, json; sys.ps1 = '> '; sys.argv[0] = {launcher!r}; import fragprune_plugins"
-    code += "; print(json.dumps(fragprune_plugins.activate().adapter.name))"
-    code = f"import os; os.chdir({str(fork)!r}); {code}"
-    assert python(code) == "vanilla-3dgs"
+def test_a_shell_finds_the_host_in_the_current_folder(fork, launcher):
+    assert fresh(main, SHELL, str(fork), launcher) == "vanilla-3dgs"
 
 
-def test_one_line_above_the_imports_is_enough_and_below_them_it_is_refused(fork, python):
-    assert python(SCRIPT, fork) == {
+def test_one_line_above_the_imports_is_enough_and_below_them_it_is_refused(fork):
+    assert fresh(main, SCRIPT, str(fork)) == {
         "steps": 2,
         "truncated": True,
         "paused": True,

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from cli.commands import run_json
 from finetune import tiny
 
 from fragprune_plugins.files import sidecar
@@ -19,14 +20,6 @@ pytestmark = pytest.mark.skipif(
     shutil.which("g++") is None or torch.version.cuda or not hasattr(torch, "accelerator"),
     reason="needs g++, and a torch of 2.6 or later without CUDA",
 )
-
-
-CPU = """
-import sys
-from fragprune_plugins.workbench.commands import main
-sys.argv[:2] = ["fragprune"]
-main()
-"""
 
 
 @pytest.fixture
@@ -92,16 +85,16 @@ def scene(tmp_path):
     return scene
 
 
-def test_a_model_learns_there_as_on_the_cpu(python, scene, tmp_path):
+def test_a_model_learns_there_as_on_the_cpu(python, scene, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     words = ["model.ply", "--data", scene, "--iters", 10, "--dropout", 0.2, "--json"]
-    found = {}
-    for kind in ("cuda", "cpu"):
-        more = ["finetune", *words, "--device", kind, "--out", f"{kind}.ply"]
-        text = "pretended.main()" if kind == "cuda" else CPU
-        found[kind] = json.loads(python(text, *more, where=tmp_path))["after"]
-    assert (found["cuda"]["engine"], found["cpu"]["engine"]) == ("cuda", "cpu")
+    text = "pretended.main()"
+    here = run_json("finetune", *words, "--device", "cpu", "--out", "cpu.ply")["after"]
+    there = python(text, "finetune", *words, "--device", "cuda", "--out", "a.ply", where=tmp_path)
+    found = json.loads(there)["after"]
+    assert (found["engine"], here["engine"]) == ("cuda", "cpu")
     for figure in ("psnr", "fragments_per_pixel", "ssim"):
-        assert found["cuda"][figure] == pytest.approx(found["cpu"][figure], rel=1e-3)
+        assert found[figure] == pytest.approx(here[figure], rel=1e-3)
 
 
 def test_a_host_trains_and_is_pruned_there(python, scene, tmp_path):

@@ -78,8 +78,11 @@ POINTS = """
 mine = mine
 [fragprune.commands]
 count = mine:count
+view = mine:count
 [fragprune.formats]
 mine = mine:FORMAT
+else = another:FORMAT
+spz = mine:FORMAT
 [fragprune.logs]
 lines = mine:Lines
 """
@@ -98,8 +101,7 @@ import json, sys
 from click.testing import CliRunner
 from fragprune_plugins.workbench.commands import cli
 results = [CliRunner().invoke(cli, line.split()) for line in sys.argv[1:]]
-assert not any(result.exit_code for result in results), [result.output for result in results]
-print(json.dumps([result.stdout for result in results]))
+print(json.dumps([(result.exit_code, result.stdout, result.stderr) for result in results]))
 """
 
 
@@ -112,56 +114,35 @@ def model(tmp_path: Path) -> Path:
 
 
 @pytest.mark.usefixtures("model")
-def test_one_package_adds_a_command_a_format_an_engine_and_a_log(tmp_path, python):
+def test_one_package_adds_a_command_formats_an_engine_and_a_log_and_takes_no_name(tmp_path, python):
     site = tmp_path / "site"
     install(site, "mine", POINTS)
     (site / "mine.py").write_text(MODULE)
-    help, _, count, drawn, _ = python(
-        COMMANDS,
+    reads = "return torch.load(reading.file, weights_only=False)"
+    other = MODULE.replace(reads, "return ()").replace('".mine"', '".else"')
+    (site / "another.py").write_text(other)
+    (tmp_path / "a.else").write_bytes(b"")
+    lines = (
         "--help",
         "export model.ply --out model.mine",
         "count model.mine --json",
         "render model.mine --engine mine --cameras cameras.json --out grey --json",
         "finetune model.mine --self --out p.mine --iters 3 --resolution 16 --train opacity "
         "--log lines:steps.txt",
-        path=site,
+        "view --help",
+        "export model.ply --out model.spz",
+        "export a.else --out a.ply",
     )
-    assert "Count the Gaussians" in help
-    assert json.loads(count) == {"gaussians": 60}
-    assert json.loads(drawn)["engine"] == "mine"
+    codes, said, told = zip(*python(COMMANDS, *lines, path=site), strict=True)
+    assert codes == (0, 0, 0, 0, 0, 0, 0, 1), told
+    assert "Count the Gaussians" in said[0]
+    assert json.loads(said[2]) == {"gaussians": 60}
+    assert json.loads(said[3])["engine"] == "mine"
     assert (tmp_path / "steps.txt").read_text().split() == ["1", "2", "3"]
-
-
-TAKEN = """
-[fragprune.commands]
-view = mine:count
-[fragprune.formats]
-spz = mine:FORMAT
-"""
-
-
-@pytest.mark.usefixtures("model")
-def test_a_name_of_ours_stays_ours_and_whoever_takes_it_is_named(tmp_path, python):
-    site = tmp_path / "site"
-    install(site, "mine", TAKEN)
-    (site / "mine.py").write_text(MODULE)
-    code = COMMANDS.replace("result.stdout", "result.output")
-    help, said = python(code, "view --help", "export model.ply --out model.spz", path=site)
-    assert "Count the Gaussians" not in help
-    assert "fragprune.commands view of mine is left out" in help
+    assert "Count the Gaussians" not in said[5]
+    assert "fragprune.commands view of mine is left out" in "".join(told)
     assert (tmp_path / "model.spz").read_bytes()[:4] != b"PK\3\4"  # as torch writes it
-    assert "model.spz" in said
-
-
-def test_a_format_that_reads_something_else_is_named(tmp_path, python):
-    site = tmp_path / "site"
-    install(site, "mine", POINTS)
-    reads = "return torch.load(reading.file, weights_only=False)"
-    (site / "mine.py").write_text(MODULE.replace(reads, "return ()"))
-    (tmp_path / "a.mine").write_bytes(b"")
-    code = COMMANDS.replace("assert not", "assert").replace("result.stdout", "result.output")
-    (said,) = python(code, "export a.mine --out a.ply", path=site)
-    assert "[plugin] format mine: tuple from a.mine; expected a Model" in said
+    assert "[plugin] format mine: tuple from a.else; expected a Model" in told[7]
 
 
 @pytest.mark.usefixtures("model")
@@ -181,13 +162,11 @@ def test_an_adapter_and_a_slice_go_with_their_folders(tmp_path, python):
     for group, values in points.items():
         lines += [f"[{group}]", *(f"{name} = {value}" for name, value in values.items())]
     install(copy, "fragprune_plugins", "\n".join(lines))
-    help, adapters, _ = python(
-        COMMANDS,
-        "--help",
-        "adapters --json",
-        "render model.ply --cameras cameras.json --engine reference --out pictures",
-        path=os.pathsep.join([str(copy), str(copy / "adapters")]),
-    )
+    render = "render model.ply --cameras cameras.json --engine reference --out pictures"
+    path = os.pathsep.join([str(copy), str(copy / "adapters")])
+    answers = python(COMMANDS, "--help", "adapters --json", render, path=path)
+    codes, (help, adapters, _), told = zip(*answers, strict=True)
+    assert not any(codes), told
     assert "  compare " in help
     assert "  audit " not in help
     adapters = json.loads(adapters)
