@@ -136,7 +136,7 @@ def test_what_a_fresh_process_does_comes_back():
         fresh(skips)
     with pytest.raises(FreshProcessError, match="exit code 3"):
         fresh(dies)
-    with pytest.raises(FreshProcessError, match="longer than 0.1 seconds"):
+    with pytest.raises(FreshProcessError, match=r"longer than 0\.1 seconds"):
         fresh(lingers, seconds=0.1)
 
 

@@ -30,6 +30,8 @@ EXCLUDED: dict[Place, str] = {
     ("wrapt.importer", "_post_import_hooks_init"): "that wrapt has added its finder",
     ("wrapt.importer", "_post_import_hooks"): "no way to unregister; ours hold and do nothing",
     ("re", "_cache"): "a cache",
+    ("re", "_cache2"): "a cache",
+    ("triton.language.extra", "modules"): "sys.modules by another name",
     ("ctypes", "_pointer_type_cache"): "a cache",
     ("_ctypes", "_pointer_type_cache"): "a cache",
     ("linecache", "cache"): "a cache of source lines, filled by tracebacks",
