@@ -149,7 +149,7 @@ def _not_compared(summary: launch.RunSummary) -> FragpruneError | None:
 
 def _expect_steps(summary: launch.RunSummary, options: launch.RunOptions) -> None:
     """Refuse a stage 2 that took no step, and warn of one that ended before its last."""
-    wanted = summary.settings["iterations"]
+    wanted = summary.settings.get("iterations", summary.steps)  # a method may count otherwise
     apart = options.stage in ("auto", "finetune") and options.from_iter is None
     begun = (summary.model_before or summary.steps) and not summary.already_finished
     if not (apart and begun) or summary.steps >= wanted:
