@@ -509,6 +509,11 @@ def _read_methods(fork: Fork) -> None:
                 at = fork.repo.at(module, node.lineno)
                 fork.refuse("row-change", at, f"reads what {name} returns", "a statement")
     fork.still = tuple(name for name in methods if name in still)
+    save = methods.get("save_ply", ast.Pass())
+    steps = {name for node, name in _method_calls(save) if text_of(node.func) == f"self.{name}"}
+    if steps & changing or any(_assigned(save, "self")):
+        place = fork.repo.place(MODEL, f"{CLASS}.save_ply")
+        fork.refuse("row-change", place, "save_ply changes the model that it writes", "none")
     keeps = methods.get("_prune_optimizer")
     if keeps is not None and "[mask]" not in text_of(keeps):
         place = fork.repo.place(MODEL, f"{CLASS}._prune_optimizer")

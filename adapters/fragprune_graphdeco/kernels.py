@@ -28,7 +28,7 @@ _FILTER = re.compile(r"\bcov(?:\[(?:0\]\[0|1\]\[1)\]|\.x|\.z)\s*\+=?\s*(?!cov\b)
 _NUMBERS = {
     "fragments fainter than": (r"\balpha<\(?([\d.]+(?:/[\d.]+)?)\)?", 1 / 255),
     "no light below": (r"\btest_T<([\d.]+)\)\{?done=true", 1e-4),
-    "Gaussians nearer than": (r"\bp_view\.z<=?(0\.[2-9]\d*|[1-9][\d.]*)", 0.2),
+    "Gaussians nearer than": (r"\bp_view\.z<=?([\d.]+)", 0.2),
     "Gaussians beyond this times their deviation:": (r"\bceil\(([\d.]+)\*sqrt\(", 3),
     "projections beyond this times the view:": (r"lim[xy]=([\d.]+)\*tan_fov", 1.3),
 }
@@ -38,9 +38,11 @@ _OF_COLOURS = r"max\(\w+,(vec3\()?0\.?0?\)?\)"
 _UNLIKE = re.compile(
     r"[;{})](?:(?:alpha|power)\*=[^;]+|(alpha|power)=\1\*[^;]+);|SortPairsDescending\(|"
     r"test_T=(?!T\*\(1(?:\.0?)?-\w*alpha\);)[^;]+;|C\[ch\]\+=[^;]+\*alpha;|"
-    r"out_color\[[^]]*\]=(?:C\[ch\]|[^;]*/[^;]*);"
+    r"out_color\[[^]]*\]=(?:C\[ch\]|[^;]*/[^;]*);|\bpower<-?[\d.]+|"
+    r"\bS\[([0-2])\]\[\2\]=(?!\w+\*scale\.[xyz];)[^;]+;|"
+    r"\bSH_C0=(?!0\.28209)[^;]+;|\bSH_C1=(?!0\.48860)[^;]+;|conic\.z,opacit\w+(?:\[\w+\])?\*\d[^}]*\}"
 )
-"""Code that blends otherwise."""
+"""Code that draws otherwise."""
 _EWA = re.compile(  # the third row is of depth: no picture has it
     r"\((\w+)/(\w+)\.z,0\.?0?,-\(?\1\*\2\.x\)?/\(\2\.z\*\2\.z\),"
     r"0\.?0?,(\w+)/\2\.z,-\(?\3\*\2\.y\)?/\(\2\.z\*\2\.z\),[^,]+,[^,]+,[^,]+\)"
@@ -226,9 +228,9 @@ class _Project:
                         yield self._finding(path, at, f"{what} {match[1]}", f"{usual:.4g}")
             for match in _UNLIKE.finditer(normal):
                 code = match[0].lstrip(";{})")
-                found = f"it blends otherwise, {_short(code)}"
+                found = f"it draws otherwise, {_short(code)}"
                 at = self._place(path, code)
-                yield self._finding(path, at, found, "T (1 - alpha), front to back")
+                yield self._finding(path, at, found, "the rule of 3DGS")
             for inside, given in _COLOURS.findall(normal):
                 if "+=0.5;" not in inside or not re.fullmatch(_OF_COLOURS, given):
                     found = f"colours of harmonics are {_short(given)}"

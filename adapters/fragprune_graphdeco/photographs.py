@@ -23,6 +23,12 @@ _BESIDE = re.compile(r"(\w+\.)*(\w*alpha_mask|background|bg|bg_color)(\.cuda\(\)
 """What a photograph with an alpha channel, and the picture with it, are cut by or put on."""
 _MASK = re.compile(r"(?<!alpha_)mask|conf(?!ig)|uncert|valid(?!at)")
 """In names of what weighs a loss at each pixel."""
+_CHANGES = re.compile(
+    r"self\.(FoV[xy] ([*/+-]=|= (self\.)?FoV[xy] )|"
+    r"original_image (\*\*=|=.*(\*\* |\.(pow|mean)\()))",
+    re.IGNORECASE,
+)
+"""Statements by which a camera changes its photograph, or the angles that it was taken with."""
 _KEEPS = {
     *("clamp", "clip", "contiguous", "cuda", "detach", "float", "permute", "squeeze", "to"),
     *("type", "unsqueeze"),
@@ -35,9 +41,18 @@ def unlike(repo: HostRepo, scripts: Iterable[str]) -> str:
 
     What scripts do only under options that are off by default does not count.
     """
-    found = [why for each in scripts for why in _of_script(repo, each)]
+    found = [*_of_cameras(repo), *(why for each in scripts for why in _of_script(repo, each))]
     said = sorted(filter(None, found), key=NOT_FOUND.__eq__)  # what was found comes first
     return (said or found or [NOT_FOUND])[0]
+
+
+def _of_cameras(repo: HostRepo) -> Iterator[str]:
+    """How cameras change their photographs, or the angles that these were taken with."""
+    module = "scene.cameras"
+    for each in every(repo.tree(module), ast.stmt):
+        if _CHANGES.match(text_of(each)):
+            at = repo.at(module, each.lineno)
+            yield f"its cameras change what they see, {text_of(each)[:60]} ({at})"
 
 
 def _of_script(repo: HostRepo, script: str) -> Iterator[str]:

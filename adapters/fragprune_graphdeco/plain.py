@@ -38,9 +38,10 @@ _OF_MODEL = re.compile(
 """Attributes of the model that a plain drawing reads."""
 _OF_CALL = re.compile(
     r"view\w*|cam\w*|\w*pose\w*|pipe\w*|scal\w*|override_color|\w*mask\w*|bg\w*|xyz|means3D|"
-    r"opacity|opacities|features|shs|dc|rotations?|\w*sh\w*"
+    r"opacity|opacities|features|shs|dc|rotations?|\w*sh\w*|iteration|drop\w*"
 )
-"""Parameters of a drawing function that move or select Gaussians, or are their values."""
+"""Parameters of a drawing function that move or select Gaussians, are their values, or say how far
+training is, as where it leaves some out."""
 _SAME = {
     *("clone", "contiguous", "cuda", "detach", "expand", "float", "permute", "repeat", "reshape"),
     *("squeeze", "to", "unsqueeze", "view"),
@@ -48,6 +49,8 @@ _SAME = {
 """Methods that keep numbers."""
 _KEEPS = {*_SAME, "clamp", "clamp_"}
 """Methods that keep the numbers of a picture."""
+_STORES = {*_SAME, "astype", "cpu", "flatten", "numpy", "transpose"}
+"""Methods that keep the numbers of a PLY."""
 _ACTIVATING = {each for names in reading.ACTIVATIONS.values() for each in names}
 _ADDED = re.compile(r"bg_color|zeros_like\(\w+\)$|\* 0\.0$")
 """What is added to a picture and leaves its Gaussians alone: a background, or zeros."""
@@ -64,7 +67,15 @@ _GSPLAT = {
     **{"opacities": "opacities", "colors": "colors_precomp"},
 }
 """Arguments of gsplat's ``rasterization`` in order, by their names in 3DGS."""
-_USUAL = {"rasterize_mode": "classic", "camera_model": "pinhole", "eps2d": 0.3}
+_CLAMPED = re.compile(
+    r"(?:(?:torch|F)\.(?:clamp|clamp_min|relu))?\((.+) \+ 0\.5"
+    r"(?:, |\)\.(?:clamp|clamp_min|relu)\()?(?:min=)?(?:0|0\.0)?\)"
+)
+"""How harmonics become colours."""
+_USUAL = {
+    **{"rasterize_mode": "classic", "camera_model": "pinhole", "eps2d": 0.3},
+    "scale_modifier": 1.0,  # a setting of the rasterizers of 3DGS
+}
 """Arguments of it that change the picture, and the values with which it draws as 3DGS does."""
 _SAVES = re.compile(r"\.save_ply\w*\(|scene\w*\.save\(")
 _LISTS = "construct_list_of_attributes"
@@ -187,7 +198,7 @@ def _of_others(model: ModelClass) -> Iterator[str]:
 
 def _columns(model: ModelClass) -> tuple[Function | None, list[str]]:
     """The function that lists a PLY's columns, and their names without numbers."""
-    listed = model.method(_LISTS) or model.method("save_ply")
+    listed = model.method(_LISTS) or model.saver
     names = dict.fromkeys(
         re.sub(r"_?(\{\})?\d*$", "", node.value)
         for node in every(listed, ast.Constant)
@@ -201,7 +212,7 @@ def _of_columns(model: ModelClass) -> Iterator[str]:
     (listed, names), at = _columns(model), model.at(_LISTS)
     if missing := [each for each in _COLUMNS if not any(n.startswith(each) for n in names)]:
         yield f"its PLY lacks the columns {', '.join(missing)} ({at})"
-    if listed is not None and listed.name != "save_ply":
+    if listed is not None and listed.name == _LISTS:
         for each in names:
             if (says := change_of(each)) and each not in _seen(model.repo):
                 yield f"its PLY also holds {each}, {says} ({at})"
@@ -237,7 +248,7 @@ def _scales(model: ModelClass) -> Iterator[str]:
 def _of_saving(model: ModelClass) -> Iterator[str]:
     """Values that are not saved as they are before activation."""
     repo, module = model.repo, model.module
-    for node in _assigned_names(model.method("save_ply")):
+    for node in _assigned_names(model.saver):
         target, value = text_of(node.targets[0]), text_of(node.value)
         shown = f"{value[:60]} ({repo.at(module, node.lineno)})"
         taken = any(_takes(node, kind) for kind in ("scaling", "opacity"))
@@ -250,14 +261,23 @@ def _of_saving(model: ModelClass) -> Iterator[str]:
         if target in ("xyz", "f_dc", "f_rest", "opacities", "scale", "rotation"):
             if re.match(r"np\.(zeros|ones)", value):
                 yield f"save_ply stores no {target}: {shown}"
-            if re.search(r"self\.\w+ ?[*+/-] ?self\.\w+", value):
-                yield f"save_ply stores a product or sum, {target} = {shown}"
-            elif _OTHER_NUMBERS.search(value) and not re.search(r"inverse|log", value):
+            elif _other_numbers(node.value):
                 yield f"save_ply stores other numbers, {target} = {shown}"
-    for each in _stored(model.method("save_ply")):
-        if _OTHER_NUMBERS.match(text_of(each)):
+    for each in _stored(model.saver):
+        if _other_numbers(each):
             shown = f"{text_of(each)[:60]} ({repo.at(module, each.lineno)})"
             yield f"save_ply stores other numbers, {shown}"
+
+
+def _other_numbers(value: ast.expr) -> bool:
+    """Whether code makes other numbers of the parameters that a PLY is to have."""
+    method = getattr(value, "func", None)
+    if isinstance(value, ast.Subscript) and not every(value.slice, ast.List):
+        return _other_numbers(value.value)
+    if isinstance(method, ast.Attribute) and method.attr in _STORES:
+        return _other_numbers(method.value)
+    known = re.search(r"inverse|log|gather|np\.(zeros|ones)", text_of(method))
+    return not (known or isinstance(value, ast.Name | ast.Attribute))
 
 
 def _assigned_names(save: Function | None) -> list[ast.Assign]:
@@ -277,7 +297,7 @@ def _of_activations(model: ModelClass) -> Iterator[str]:
     What is saved activated needs none.
     """
     repo, module = model.repo, model.module
-    saved = _assigned_names(model.method("save_ply"))
+    saved = _assigned_names(model.saver)
     text = "".join([text_of(repo.tree(module)), *_scripts(repo).values()])
     functions = every(repo.tree(module), ast.FunctionDef)
     used = ("__init__", "setup_functions")
@@ -299,13 +319,6 @@ def _of_activations(model: ModelClass) -> Iterator[str]:
             yield f"its {attribute} is a method ({model.at(attribute)})"
 
 
-_OTHER_NUMBERS = re.compile(
-    r"(np|torch|F)\.(abs|clip|clamp|exp|round|sigmoid|sqrt|tanh)\(|\w*SH2RGB\(|"
-    r".+(\.(clip|clamp|half|round)\(|\[\W*\[\d| (\*\*|[*/@]) )"
-)
-"""Code that makes other numbers of what it takes."""
-
-
 def _stored(save: Function | None) -> list[ast.expr]:
     """What a function puts side by side into the columns of a PLY."""
     joined = (each for each in every(save, ast.Call) if text_of(each.func) == "np.concatenate")
@@ -315,7 +328,7 @@ def _stored(save: Function | None) -> list[ast.expr]:
 
 def _of_getters(model: ModelClass) -> Iterator[tuple[str, bool]]:
     """Getters of other values than the PLY's; true if only where an attribute was set later."""
-    saved = text_of(model.method("save_ply"))
+    saved = text_of(model.saver)
     if model.method("get_xyz") is None:  # a class that only saves
         model = ModelClass(model.repo)
     always = reading.computed_getters(model, reading.unset(model))
@@ -328,6 +341,15 @@ def _of_getters(model: ModelClass) -> Iterator[tuple[str, bool]]:
     for kind in reading.computed_getters(model, options):
         if kind != "xyz" or "self.get_xyz" not in saved:
             yield f"get_{kind} is computed ({model.at(f'get_{kind}')})", kind not in always
+
+
+def _of_covariances(model: ModelClass) -> Iterator[str]:
+    """Covariances to which something is added."""
+    for each in every(model.repo.definition(model.module, model.name), ast.FunctionDef):
+        added = re.search(r".* [+-]=? .*", text_of(each))
+        if added and re.fullmatch(r"(get|build)_covariance(_from\w+)?", each.name):
+            at = model.repo.at(model.module, each.lineno)
+            yield f"{each.name} makes other covariances, {added[0].strip()[:60]} ({at})"
 
 
 def _of_positions(model: ModelClass) -> Iterator[str]:
@@ -541,7 +563,8 @@ class Drawing:
         named = (*taken.posonlyargs, *taken.args, *taken.kwonlyargs)
         self.parameters = {each.arg for each in named}
         self.off = off_by_default(function) - {*on}
-        given = zip(reversed(taken.args), reversed(taken.defaults), strict=False)
+        given = [*zip(reversed(taken.args), reversed(taken.defaults), strict=False)]
+        self.defaults = {a.arg: v for a, v in given}
         self.switches = {a.arg for a, v in given if isinstance(getattr(v, "value", None), bool)}
         self.values: dict[str, list[ast.expr]] = {}
         self.unasked = reading.skipped(function, reading.as_options(repo, ("arguments",)))
@@ -633,7 +656,11 @@ class Drawing:
             yield from self.made.get(node.id, ())
         elif isinstance(node, ast.Subscript):
             yield from self._roots(node.value)
-        elif isinstance(node, ast.Lambda | ast.ListComp | ast.GeneratorExp | ast.Dict):
+        elif isinstance(node, ast.ListComp | ast.GeneratorExp):
+            for each in node.generators:
+                self._assign(each.target, each.iter)
+            yield from self._roots(node.elt)
+        elif isinstance(node, ast.Lambda | ast.Dict):
             return
         else:
             for child in ast.iter_child_nodes(node):
@@ -787,10 +814,13 @@ class Drawing:
         given, name, at = self.arguments, self.function.name, self._at(self.function)
         if others := self._others(given.get("shs")):
             yield f"{name} makes colours from {', '.join(others[:4])} ({at})", False
-        for argument, usual in _USUAL.items():
-            if argument in given and getattr(given[argument], "value", None) != usual:
-                how = f"{argument}={text_of(given[argument])}, not {usual!r}"
-                yield f"{name} draws with {how} ({at})", False
+        for each in (*(e.given for e in read_calls(self.repo, self.module, name)), given):
+            for argument, usual in _USUAL.items():
+                value = each.get(argument)
+                value = self.defaults.get(getattr(value, "id", ""), value)
+                if not isinstance(value, ast.Name | None) and getattr(value, "value", 0) != usual:
+                    how = f"{argument}={text_of(value)}, not {usual!r}"
+                    yield f"{name} draws with {how} ({at})", True
         if value := given.get("colors_precomp"):
             channels = list(self._channels(value))
             others = [text_of(value)] if isinstance(value, ast.Call) else self._others(*channels)
@@ -799,6 +829,24 @@ class Drawing:
                 own = any(each.startswith(f"{self.model}.get_features") for each in roots)
                 what = f"makes colours from {', '.join(others[:4])} ({self._at(value)})"
                 yield f"{name} {what}", own and self._beside(others)
+            elif not self.drawn_from and (
+                made := next(filter(None, map(self._other_colours, channels)), None)
+            ):
+                what = f"colours that are not max(harmonics + 0.5, 0), {text_of(made)[:60]}"
+                yield f"{name} makes {what} ({self._at(made)})", True
+
+    def _other_colours(self, value: ast.expr, seen: tuple[str, ...] = ()) -> ast.expr | None:
+        """The code that makes colours of the model's features in another way than 3DGS."""
+        name = getattr(value, "id", "")
+        if name:
+            others = self.values.get(name, []) if name not in seen else []
+            made = (self._other_colours(e, (*seen, name)) for e in others if self._counts(e))
+            return next(filter(None, made), None)
+        drawn = text_of(getattr(self.call, "func", None))
+        own = any("features" in e for e in self._roots(value)) and "rasterization" not in drawn
+        clamped = _CLAMPED.fullmatch(text_of(value))
+        texts = [clamped[1], *map(text_of, self.values.get(clamped[1], []))] if clamped else []
+        return value if own and not any(each.startswith("eval_sh(") for each in texts) else None
 
     def shapes(self) -> Iterator[tuple[str, bool]]:
         """Likewise where its Gaussians are, and how large and opaque."""
@@ -807,8 +855,11 @@ class Drawing:
         for argument in ("means3D", "opacities", "scales", "rotations", "cov3D_precomp"):
             value = self.arguments.get(argument)
             named = self.values.get(getattr(value, "id", ""), [])
-            if argument == "cov3D_precomp" and not any(map(self._counts, named)):
-                continue
+            if argument == "cov3D_precomp":
+                if not any(self._counts(each) and not is_off(each) for each in named):
+                    continue
+                if not self.drawn_from:
+                    yield from ((each, True) for each in _of_covariances(self._model()))
             if others := self._others(value):
                 what = f"makes {argument} from {', '.join(others[:4])}, not from its PLY alone"
                 kept = f"{self.model}.{own.get(argument)}" in self._roots(value)
@@ -816,7 +867,7 @@ class Drawing:
                 yield said, kept and self._beside(others)
                 continue
             roots = {*self._roots(value)} if value and not self.drawn_from else set()
-            alone = roots and all("." in each for each in roots)  # of the model's values
+            alone = roots and all("." in e or e.startswith("scal") for e in roots)
             if alone and (made := self._made_into(value, own=True)):  # type: ignore[arg-type]
                 what = f"makes {argument} otherwise than its PLY has them, {text_of(made)[:60]}"
                 yield f"{self.function.name} {what} ({self._at(made)})", False

@@ -59,6 +59,14 @@ class ModelClass:
         return self.repo.place(self.module, f"{self.name}.{name}")
 
     @property
+    def saver(self) -> Function | None:
+        """The method by which its scene, or else a script, writes a PLY."""
+        calls = every(self.repo.function("scene", "Scene.save"), ast.Call)
+        called = {getattr(each.func, "attr", "") for each in calls}
+        names = {"save_ply"} & called or {e for e in called if re.match(r"save\w*ply", e)}
+        return self.method(next(iter(sorted(names)), "")) or self.method("save_ply")
+
+    @property
     def getters(self) -> dict[str, Function | None]:
         """By the kinds of values that they give."""
         return {kind: self.method(f"get_{kind}") for kind in GETTERS}
@@ -181,6 +189,9 @@ def failing(repo: HostRepo, scripts: tuple[str, ...]) -> tuple[str, ...]:
     saving = text_of(repo.function("scene", "Scene.save"))
     if re.search(r"\b(os\.(replace|rename)|shutil\.move)\(", saving):
         found.append("Scene.save renames the PLY that it saves, and loses its thresholds")
+    saver = ModelClass(repo).saver
+    if saver and saver.name != "save_ply" and ".save_ply(" not in text_of(saver):
+        found.append(f"Scene.save writes its PLY by {saver.name}, which saves no thresholds")
     found += [*_left_out(repo, scripts)][:1]
     for script in scripts:
         module = module_of(script)
@@ -252,7 +263,8 @@ def _left_out(repo: HostRepo, scripts: Iterable[str]) -> Iterator[str]:
     named = {name for each in saving for name, value in each.items() if not is_off(value)}
     off = off_by_default(save) - named if save else set()
     gone = skipped(save, lambda node: [None] if getattr(node, "id", "") in off else [])
-    for each in every(save, ast.Subscript):
+    counted = [text_of(e.target) for e in every(save, ast.For) if "range(" in text_of(e.iter)]
+    for each in (e for e in every(save, ast.Subscript) if text_of(e.slice) not in counted):
         if each not in gone and (of := chosen(each)) and _ROWS.fullmatch(text_of(of)):
             yield f"save_ply leaves out rows, {text_of(each)} ({repo.at(MODEL, each.lineno)})"
 

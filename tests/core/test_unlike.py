@@ -96,3 +96,12 @@ def test_each_script_that_learns_is_to_compare_them(tmp_path):
 @pytest.mark.parametrize("loss", ["score_distillation(image)", "l1_loss(depth, seen_depth)"])
 def test_no_comparison_is_found(tmp_path, loss):
     assert why(tmp_path, loss=loss) == NOT_FOUND
+
+
+@pytest.mark.parametrize("change", ["FoVx *= 1.1", "original_image = image.clamp(0, 1) ** 2.2"])
+def test_a_camera_may_change_what_it_sees(tmp_path, change):
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene/cameras.py").write_text(
+        f"class Camera:\n    def __init__(self):\n        self.{change}\n"
+    )
+    assert why(tmp_path).startswith("its cameras change what they see")

@@ -93,12 +93,12 @@ EXPOSED = """rotations=rotations
 """
 CALL = "    image, radii, depth, used = rasterizer(\n"
 REUSED = f"""    seen = pc.get_features
-    colours = torch.clamp(seen, 0)
+    colours = torch.clamp_min(eval_sh(seen) + 0.5, 0)
     seen = pc.get_objects
 {CALL}        colors_precomp=colours,
 """
 
-JOINED = """    colours = torch.clamp(pc.get_features, 0)
+JOINED = """    colours = torch.clamp_min(eval_sh(pc.get_features) + 0.5, 0)
     colours = torch.cat([colours, pc.net(depths)], dim=1)
     colours = torch.cat([colours, depths], dim=1)
     whole, radii = rasterizer(means3D=means3D, opacities=opacity, colors_precomp=colours)
@@ -325,6 +325,8 @@ def test_the_nearest_host_is_of_this_family(fork):
             "GaussianModel.get_opacity is replaced",
         ),
         ("shs=shs, scales", "colors_precomp=pc.net(view), shs=shs, scales", "colours from pc.net"),
+        (CALL, f"    rgb = torch.sigmoid(pc.get_features)\n{CALL}colors_precomp=rgb,", "not max("),
+        ("= self._opacity.detach()", "= self.baked(self._opacity).detach()", "other numbers"),
     ],
 )
 def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):

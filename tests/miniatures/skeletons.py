@@ -12,6 +12,7 @@ SETTINGS = [
 
 GETTERS = {"get_xyz": "self._xyz", "get_opacity": "self.opacity_activation(self._opacity)"}
 
+SIZED = "scale_modifier"  # 1 is its neutral value
 FLAGS = """
 def report(scene, iteration):
     scene.save(iteration)
@@ -93,7 +94,7 @@ def skeleton(
         + "".join(
             f"def {function}({parameters}, override_color=None):\n"
             "    s = GaussianRasterizationSettings("
-            f"{', '.join(f'{name}=0' for name in [*passed, *settings])})\n"
+            f"{', '.join(f'{name}={int(name == SIZED)}' for name in [*passed, *settings])})\n"
             "    rasterizer = GaussianRasterizer(raster_settings=s)\n"
             f"    {values} = rasterizer(means3D=1{given})\n"
             for function in functions
