@@ -660,7 +660,7 @@ def test_another_model_that_a_script_trains_counts_if_it_stores_something_else(f
     (tmp_path / "scene/folded_model.py").write_text(folded)
     assert read_plain(repo)
     (tmp_path / "train_folded.py").write_text("from scene import Folded\n")
-    assert "Folded, which a script here trains: save_ply stores a product" in str(
+    assert "Folded, which a script here trains: save_ply stores other numbers" in str(
         read_plain(HostRepo(tmp_path)).reasons
     )
     script = tmp_path / "train.py"
