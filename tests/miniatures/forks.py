@@ -144,7 +144,8 @@ def fork(
         "scene/gaussian_model.py": MODEL,
         "gaussian_renderer/__init__.py": RENDER.format(
             package=package,
-            settings=", ".join(f"{name}={int(name == 'scale_modifier')}" for name in SETTINGS) + settings,
+            settings=", ".join(f"{name}={int(name == 'scale_modifier')}" for name in SETTINGS)
+            + settings,
             values=values,
             arguments=arguments,
             keys="".join(f', "{name}": {name}' for name in further),
