@@ -40,7 +40,7 @@ _UNLIKE = re.compile(
     r"test_T=(?!T\*\(1(?:\.0?)?-\w*alpha\);)[^;]+;|C\[ch\]\+=[^;]+\*alpha;|"
     r"out_color\[[^]]*\]=(?:C\[ch\]|[^;]*/[^;]*);|\bpower<-?[\d.]+|"
     r"\bS\[([0-2])\]\[\2\]=(?!\w+\*scale\.[xyz];)[^;]+;|"
-    r"\bSH_C0=(?!0\.28209)[^;]+;|\bSH_C1=(?!0\.48860)[^;]+;|conic\.z,opacit\w+(?:\[\w+\])?\*\d[^}]*\}"
+    r"SH_C0=(?!0\.28209)[^;]+;|SH_C1=(?!0\.48860)[^;]+;|conic\.z,opacit\w+(?:\[\w+\])?\*\d[^}]*\}"
 )
 """Code that draws otherwise."""
 _EWA = re.compile(  # the third row is of depth: no picture has it

@@ -949,6 +949,9 @@ CHOSEN = """    def save_ply(self, path, kept=None):
         if kept is not None:
             xyz, opacities = xyz[kept], opacities[kept]
         write(path, xyz, opacities)"""
+ROW_BY_ROW = """    def save_ply(self, path):
+        for row in range(len(self._xyz)):
+            write(path, self._xyz[row])"""
 LEFT_OUT = {
     "where a script names them": (
         CHOSEN,
@@ -961,6 +964,7 @@ LEFT_OUT = {
     "where nobody names them": (CHOSEN, "gaussians.save_ply(path)", False),
     "where they are None": (CHOSEN, "gaussians.save_ply(path, kept=None)", False),
     "not at all": (WRITES.format(":, 0"), "scene.save(9)", False),
+    "where they are written one by one": (ROW_BY_ROW, "scene.save(9)", False),
 }
 
 
@@ -1154,3 +1158,18 @@ def test_exposures_that_a_resumed_fork_would_lose_are_refused(tmp_path):
     with pytest.raises(UsageError, match="exposures"):
         ForkAdapter().refuse(fork(tmp_path), ["--train_test_exp"], stage="auto", device="cuda")
     ForkAdapter().refuse(HostRepo(tmp_path), ["--eval"], stage="auto", device="cuda")
+
+
+@pytest.mark.parametrize("through", [True, False])
+def test_a_scene_that_another_method_saves_keeps_thresholds_if_it_goes_through_save_ply(
+    tmp_path, through
+):
+    saver = "    def save_fused_ply(self, path):\n        "
+    saver += "self.save_ply(path)" if through else "PlyData(self._xyz).write(path)"
+    fork(tmp_path, (SAVED, f"{saver}\n\n{SAVED}"))
+    scene = tmp_path / "scene/__init__.py"
+    scene.write_text(
+        f"{scene.read_text()}\n    def save(self, i):\n        self.gaussians.save_fused_ply(i)\n"
+    )
+    found = "; ".join(errors(HostRepo(tmp_path)))
+    assert ("by save_fused_ply, which saves no thresholds" in found) == (not through)

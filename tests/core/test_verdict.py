@@ -327,6 +327,11 @@ def test_the_nearest_host_is_of_this_family(fork):
         ("shs=shs, scales", "colors_precomp=pc.net(view), shs=shs, scales", "colours from pc.net"),
         (CALL, f"    rgb = torch.sigmoid(pc.get_features)\n{CALL}colors_precomp=rgb,", "not max("),
         ("= self._opacity.detach()", "= self.baked(self._opacity).detach()", "other numbers"),
+        (
+            "raster_settings=settings",
+            "raster_settings=GaussianRasterizationSettings(scale_modifier=0.5)",
+            "draws with scale_modifier=0.5, not 1.0",
+        ),
     ],
 )
 def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):
@@ -392,6 +397,23 @@ def test_a_mask_of_which_a_rasterizer_gives_a_picture_scales_no_opacities(fork, 
     given = ("image, radii, depth, used =", f"image, {seen}, radii, used =")
     reasons = read_plain(fork(taken, given, ('"opacity"]', '"opacity", "mask"]'))).reasons
     assert ("masks that scale the opacities" in str(reasons)) == bool(reasons) == (seen == "depth")
+
+
+def test_opacities_that_are_dropped_as_training_goes_on_are_no_others(fork):
+    given = ("override_color=None):", "override_color=None, iteration=None):")
+    trains = ("scene.save(", "render(training=True, iteration=iteration), scene.save(")
+    assert read_plain(fork(given, trains, ("* pc.dropout", "* dropped(iteration / 1000)")))
+
+
+def test_covariances_to_which_something_is_added_are_others(fork):
+    sized = "    def get_covariance(self, size):\n        return cov(size) + 0.1\n\n"
+    changes = [
+        ("if pipe.compute_cov3D_python", "if pipe.of_covariances"),
+        ("shs=shs, scales", "cov3D_precomp=cov3D, shs=shs, scales"),
+    ]
+    assert read_plain(fork(*changes))
+    found = read_plain(fork(*changes, ("    def construct", f"{sized}    def construct"))).reasons
+    assert "get_covariance makes other covariances" in str(found)
 
 
 def test_values_that_a_drawing_function_is_given_may_be_those_of_a_ply(fork):

@@ -104,6 +104,7 @@ def test_sources_that_a_file_compiles_at_import_are_read_too(tmp_path, projectio
                 ("if (p_view.z <= 0.0f) return;", "Gaussians nearer than 0.0"),
                 ("if (power < -4.5f) continue;", "it draws otherwise, power<-4.5"),
                 ("S[2][2] = 1e-4f;", "it draws otherwise, S[2][2]="),
+                ("const float SH_C0 = 0.3f;", "it draws otherwise, SH_C0=0.3;"),
                 ("r = ceil(2.f * sqrt(l));", "their deviation: 2."),
                 ("alpha = alpha * 0.5f;", "it draws otherwise, alpha=alpha*0.5;"),
                 ("float test_T = T * (1 - alpha * alpha);", "it draws otherwise, test_T="),
