@@ -12,7 +12,17 @@ from typing import Any
 import fragprune_graphdeco as graphdeco
 from fragprune_3dgs_fork import rasterizer
 from fragprune_3dgs_fork.rasterizer import Output
-from fragprune_graphdeco import assigned, every, kernels, plain, reading, text_of
+from fragprune_graphdeco import (
+    Drawing,
+    arguments,
+    assigned,
+    every,
+    failing,
+    kernels,
+    reading,
+    syntax,
+    text_of,
+)
 from fragprune_plugins.adapting import Finding, Function, HostRepo, is_off, nodes, off_by_default
 
 MODEL, CLASS, RENDERER = reading.MODEL, "GaussianModel", "gaussian_renderer"
@@ -160,7 +170,7 @@ class Fork:
         made = _SET | {to.attr for to, _ in pairs if isinstance(to, ast.Attribute)}
         known = reading.as_options(self.repo, self.command)
         for tree in self.trees.values():
-            skipped = reading.skipped(tree, known)
+            skipped = syntax.skipped(tree, known)
             named = {each: reading.options_of(each, known) for each in {*skipped.values()}}
             under = {node: named[test] for node, test in skipped.items()}
             found |= {node: names for node, names in under.items() if made.isdisjoint(names)}
@@ -221,8 +231,8 @@ def _read_scripts(fork: Fork, scripts: tuple[str, ...]) -> None:
         made = [each for each in reading.made_models(repo, module) if each not in networks]
         if CLASS in made and len(set(made)) == 1:
             fork.scripts += (script,)
-            fork.options |= reading.overruling(repo, module)
-            for found in reading.failing(repo, (script,)):
+            fork.options |= failing.overruling(repo, module)
+            for found in failing.reasons(repo, (script,)):
                 fork.refuse("script", script, found, "a script that runs")
             if len(made) > 1 or _in_loop(fork.tree(script), CLASS):
                 fork.one_run = f"{script} makes several models"
@@ -289,10 +299,10 @@ def _size(repo: HostRepo, script: str) -> str:
         read = {each.id for size in sizes for each in every(size, ast.Name)}
         cameras = {each for each in parameters if _CAMERA.match(each)} | {*parameters[:1]}
         for call in (each for each in calls if getattr(each.func, "id", "") == name):
-            passed = reading.passed(call, parameters)
-            for parameter in sorted((passed.keys() & read) - cameras):
-                if not is_off(passed[parameter]):
-                    return f"{parameter}={text_of(passed[parameter])}"
+            named = syntax.passed(call, parameters)
+            for parameter in sorted((named.keys() & read) - cameras):
+                if not is_off(named[parameter]):
+                    return f"{parameter}={text_of(named[parameter])}"
     return ""
 
 
@@ -664,7 +674,7 @@ def _read_draws(fork: Fork) -> None:
             refuse("a result that is not unpacked", "its values")
             continue
         fork.draws += (Draw(name, camera, model, calls),)
-        source = plain.Drawing(repo, RENDERER, body)
+        source = Drawing(repo, RENDERER, body)
         filled = {getattr(each.value, "id", "") for each in every(body, ast.Subscript)}
         for call in calls:
             _check_call(fork, at, name, call)
@@ -673,8 +683,8 @@ def _read_draws(fork: Fork) -> None:
             if blended not in filled and re.search(r"torch\.(zeros|empty)\(", made):
                 refuse(f"{blended}, which is empty unless asked for", "channels of every Gaussian")
         for node in every(body, ast.Call) if name in called else ():
-            if "means3D" in plain.arguments(node):
-                other = plain.Drawing(repo, RENDERER, body, call=node)
+            if "means3D" in arguments(node):
+                other = Drawing(repo, RENDERER, body, call=node)
                 for found in (why for why, moves in other.shapes() if not moves):
                     refuse(found, "the model's own Gaussians")
                 if selected := other.selection():
@@ -741,7 +751,7 @@ def _stays_off(fork: Fork, function: str, value: ast.expr | None) -> bool:
         return False
     calls = [node for tree in fork.trees.values() for node in every(tree, ast.Call)]
     own = [getattr(each.func, "id", "") == function for each in calls]
-    given = [reading.passed(each, names if by else ()) for each, by in zip(calls, own, strict=True)]
+    given = [syntax.passed(each, names if by else ()) for each, by in zip(calls, own, strict=True)]
     return all(_stays_off(fork, "", each.get(value.id, ast.Constant(None))) for each in given)
 
 

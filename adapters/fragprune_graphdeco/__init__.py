@@ -3,12 +3,19 @@
 adapter       the base of their adapters: seams, names, files
 call          the rasterizer's call in their source
 densifying    the rows that their densify methods copy
-reading       the getters and the flags that every adapter needs
-kernels       the rule in the CUDA sources of a vendored rasterizer
-photographs   whether a training makes the drawn picture itself like its photographs
-plain         whether the PLY that a codebase saves is plain 3DGS
 proof         proves their rasterizers: it draws by both, and ``likeness`` compares
 stand_ins     modules of ours for their compiled packages
+
+What is read in a checkout, each built on those below it:
+
+plain         whether the PLY that a codebase saves is plain 3DGS
+drawing       what a drawing function makes the rasterizer's inputs and its picture of
+saved         what a model saves
+failing       what makes a training script fail, or pass all seams by
+photographs   whether a training makes the drawn picture itself like its photographs
+kernels       the rule in the CUDA sources of a vendored rasterizer
+reading       the model, the scripts and their options
+syntax        code as such
 
 Every name here is imported as itself: that is how Python says that a module passes it on.
 Importing this package imports no torch; ``proof``, ``likeness`` and ``stand_ins`` do.
@@ -39,11 +46,13 @@ from fragprune_graphdeco.densifying import clones as clones
 from fragprune_graphdeco.densifying import needy as needy
 from fragprune_graphdeco.densifying import reaches as reaches
 from fragprune_graphdeco.densifying import splits as splits
+from fragprune_graphdeco.drawing import Drawing as Drawing
+from fragprune_graphdeco.drawing import arguments as arguments
 from fragprune_graphdeco.kernels import SURFEL as SURFEL
 from fragprune_graphdeco.plain import read_models
-from fragprune_graphdeco.reading import assigned as assigned
-from fragprune_graphdeco.reading import every as every
-from fragprune_graphdeco.reading import text_of as text_of
+from fragprune_graphdeco.syntax import assigned as assigned
+from fragprune_graphdeco.syntax import every as every
+from fragprune_graphdeco.syntax import text_of as text_of
 from fragprune_plugins.adapting import HostRepo, Plain, hookimpl
 
 

@@ -13,11 +13,13 @@ from pathlib import Path
 from types import MappingProxyType, ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
-from fragprune_graphdeco import photographs, plain, reading
+from fragprune_graphdeco import failing, photographs, reading
 from fragprune_graphdeco.call import CallInSource, RasterizerCall, drawing_functions, read_calls
 from fragprune_graphdeco.densifying import clones, splits
+from fragprune_graphdeco.drawing import Drawing, pictures
 from fragprune_graphdeco.kernels import SPLAT, Kernel, read_kernels, vendored
-from fragprune_graphdeco.reading import every, module_of, text_of
+from fragprune_graphdeco.reading import module_of
+from fragprune_graphdeco.syntax import entries, every, text_of
 from fragprune_plugins.adapting import (
     CHECKPOINT_KEY,
     GROUPS,
@@ -311,7 +313,7 @@ class GraphdecoAdapter(ScriptAdapter):
         for module, _, name in (each.rpartition(":") for each in self.own_names):
             module = module or MODEL
             missing += [] if repo.mentions([module], [name]) else [f"no {name} in {module}"]
-        missing += reading.failing(repo, self.scripts_of(repo))
+        missing += failing.reasons(repo, self.scripts_of(repo))
         packages = dict.fromkeys([self.package, *(c.package for c in self.calls if c.package)])
         return [
             *self.other_host(repo, missing),
@@ -330,10 +332,10 @@ class GraphdecoAdapter(ScriptAdapter):
         found = []
         for name in dict.fromkeys(each.function for each in accepted):
             body = repo.function(module, name)
-            drawn = plain.Drawing(repo, module, body, self.drawn_from).inputs() if body else ()
+            drawn = Drawing(repo, module, body, self.drawn_from).inputs() if body else ()
             found += [(name, reason, f"a drawing of {values}") for reason, _ in drawn]
             returned = (each.value for each in every(body, ast.Return))
-            if body and any(isinstance(n, ast.Dict) and not plain.pictures(n) for n in returned):
+            if body and any(isinstance(n, ast.Dict) and not pictures(n) for n in returned):
                 found.append((name, "it returns no render", "the picture under this name"))
         return [Finding.error("drawn-values", f"{module}:{name}", *each) for name, *each in found]
 
@@ -584,7 +586,7 @@ def _opaque(repo: HostRepo, scene: Path) -> bool:
 
 def group_names(function: Function | None) -> tuple[str, ...]:
     """Names of the param groups that a function spells out as dicts, in source order."""
-    named = (each for each in reading.entries(function, "name") if isinstance(each, ast.Constant))
+    named = (each for each in entries(function, "name") if isinstance(each, ast.Constant))
     ordered = sorted(named, key=lambda each: (each.lineno, each.col_offset))
     return tuple(str(each.value) for each in ordered)
 

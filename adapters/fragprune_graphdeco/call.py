@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
 
-from fragprune_graphdeco.reading import assigned, every, text_of
+from fragprune_graphdeco.syntax import assigned, every, text_of
 from fragprune_plugins.adapting import Function, HostRepo, nodes
 
 SETTINGS, RASTERIZER = "GaussianRasterizationSettings", "GaussianRasterizer"

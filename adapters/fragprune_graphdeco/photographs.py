@@ -11,7 +11,7 @@ import re
 from collections.abc import Collection, Iterable, Iterator
 
 from fragprune_graphdeco import reading
-from fragprune_graphdeco.reading import assigned, every, text_of
+from fragprune_graphdeco.syntax import assigned, every, skipped, text_of
 from fragprune_plugins.adapting import Function, HostRepo, nodes
 
 NOT_FOUND = "what its training compares with photographs was not found"
@@ -60,7 +60,7 @@ def _of_script(repo: HostRepo, script: str) -> Iterator[str]:
     why, learns, known = NOT_FOUND, False, reading.as_options(repo, ("arguments", script))
     for module, tree in reading.reached(repo, [script]).items():
         for function in reading.learning(tree):
-            learns, gone = True, reading.skipped(function, known)
+            learns, gone = True, skipped(function, known)
             for node, sides in (pair for pair in _compared(function) if pair[0] not in gone):
                 kinds = [_kinds(function, each, gone) for each in sides]
                 if sorted(map(sorted, kinds)) == [["drawn"], ["photograph"]]:

@@ -1,18 +1,16 @@
-"""Reads what adapters of this family need: getters of the model and flags of the script."""
+"""Reads what adapters of this family need: the model, the scripts and their options."""
 
 from __future__ import annotations
 
 import ast
-import contextlib
-import operator
 import re
-from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
+from fragprune_graphdeco.syntax import Known, assigned, constant, decided, every, skipped, text_of
 from fragprune_plugins.adapting import (
     CommandLine,
     Finding,
@@ -22,7 +20,6 @@ from fragprune_plugins.adapting import (
     imported,
     is_off,
     nodes,
-    off_by_default,
 )
 
 MODEL = "scene.gaussian_model"  # where 3DGS defines its model
@@ -118,133 +115,10 @@ def unset(model: ModelClass) -> set[str]:
     return {k for k, v in values.items() if v and all(getattr(n, "value", n) is None for n in v)}
 
 
-Node = TypeVar("Node", bound=ast.AST)
-
-
-@lru_cache(maxsize=1 << 16)
-def text_of(node: ast.AST | None) -> str:
-    """A part of a tree from ``parsed`` as code, cached: many ask; "" of None."""
-    return ast.unparse(node) if node else ""
-
-
-def every(tree: ast.AST | None, *kinds: type[Node]) -> tuple[Node, ...]:
-    """Those of these kinds among ``nodes``."""
-    return _every(tree, kinds)
-
-
-@lru_cache(maxsize=4096)
-def _every(tree: ast.AST | None, kinds: tuple[type[Node], ...]) -> tuple[Node, ...]:
-    return tuple(each for each in nodes(tree) if isinstance(each, kinds))
-
-
-def assigned(tree: ast.AST | None) -> list[tuple[ast.expr, ast.expr]]:
-    """What gets which value in assignments, one by one where tuples do."""
-    pairs = [(each, node.value) for node in every(tree, ast.Assign) for each in node.targets]
-    several = [(a, b) for a, b in pairs if isinstance(a, ast.Tuple) and isinstance(b, ast.Tuple)]
-    singles = (each for a, b in several for each in zip(a.elts, b.elts, strict=False))
-    return [*(each for each in pairs if each not in several), *singles]
-
-
-def first_of(node: ast.AST | None) -> ast.AST | None:
-    """The first part of a tuple; other code as it is."""
-    return node.elts[0] if isinstance(node, ast.Tuple) and node.elts else node
-
-
-def chosen(node: ast.AST) -> ast.expr | None:
-    """What code takes rows of by a mask or by indices, as ``xyz[mask]`` of ``xyz``; else None."""
-    if not isinstance(node, ast.Subscript):
-        return None
-    return None if isinstance(first_of(node.slice), ast.Slice | ast.Constant) else node.value
-
-
-def entries(tree: ast.AST | None, name: str) -> list[ast.expr]:
-    """What dicts have under a name."""
-    dicts = every(tree, ast.Dict)
-    pairs = (pair for each in dicts for pair in zip(each.keys, each.values, strict=True))
-    return [value for key, value in pairs if getattr(key, "value", "") == name]
-
-
-def passed(call: ast.Call, names: Iterable[str]) -> dict[str, ast.expr]:
-    """The values of a call by the names of what it calls takes, in order."""
-    named = {each.arg: each.value for each in call.keywords if each.arg}
-    return dict(zip(names, call.args, strict=False)) | named
-
-
 def made_models(repo: HostRepo, module: str) -> list[str]:
     """Classes of models that a script makes, by their names, once for each place."""
     names = [getattr(each.func, "id", "") for each in every(repo.tree(module), ast.Call)]
     return [name for name in names if name.endswith("Model") or name.startswith("GaussianModel")]
-
-
-_ELSEWHERE = re.compile(r"\w+(?:\.\w+)*\.(?:scene(?:\.\w+)*|gaussian_renderer)")
-
-
-@lru_cache(maxsize=64)  # of the adapters, many ask
-def failing(repo: HostRepo, scripts: tuple[str, ...]) -> tuple[str, ...]:
-    """Why scripts fail or pass all seams by: modules that are imported under other names, which are
-    others to Python; another framework; compiled training; calls that their functions do not take;
-    a PLY that gets its name after it was saved.
-    """
-    found = [*_imported_elsewhere(repo)][:1]
-    saving = text_of(repo.function("scene", "Scene.save"))
-    if re.search(r"\b(os\.(replace|rename)|shutil\.move)\(", saving):
-        found.append("Scene.save renames the PLY that it saves, and loses its thresholds")
-    saver = ModelClass(repo).saver
-    if saver and saver.name != "save_ply" and ".save_ply(" not in text_of(saver):
-        found.append(f"Scene.save writes its PLY by {saver.name}, which saves no thresholds")
-    found += [*_left_out(repo, scripts)][:1]
-    for script in scripts:
-        module = module_of(script)
-        tree, home = repo.tree(module), home_of(repo, module)
-        if home.startswith("scene") and home != MODEL:
-            found.append(f"{script} trains the GaussianModel of {home}")
-        if "jittor" in imported(tree):
-            found.append(f"{script} trains by jittor")
-        for node in learning(tree):
-            if any("torch.compile" in text_of(each) for each in node.decorator_list):
-                found.append(f"{script} compiles {node.name}, which trains")
-        found += [*_broken(repo, module)][:1]
-        found += (*_misfits(repo, module), *_absent(repo, module), *_own_options(repo, module))[:1]
-        found += [f"{script} draws by {each}" for each in _drawn_elsewhere(repo, module)][:1]
-    return tuple(found)
-
-
-def _imported_elsewhere(repo: HostRepo) -> Iterator[str]:
-    """Modules of the training code that are imported as if they lay in another folder."""
-    for module in ("gaussian_renderer", "scene", MODEL, "train"):
-        for node in getattr(repo.tree(module), "body", ()):
-            if isinstance(node, ast.Import | ast.ImportFrom):
-                name = next(iter(repo.imported_by(module, node)))
-                top = name.split(".")[0]
-                if _ELSEWHERE.fullmatch(name) and not (
-                    repo.path(top) or (repo.root / top).is_dir()
-                ):
-                    at = repo.at(module, node.lineno)
-                    yield f"{at} imports {name}, which is no module of this folder"
-
-
-_OWN = ("arguments", "scene", "utils")
-"""Packages that a codebase of this family has itself, without submodules."""
-
-
-def _broken(repo: HostRepo, module: str) -> Iterator[str]:
-    """Modules that a script cannot import, though it does at once, not only where they are there.
-
-    A script in a folder may have others beside it.
-    """
-    alone, waiting = "." not in module, [module]
-    own = ["train", *(each for each in _OWN if (repo.root / each).is_dir())] if alone else []
-    for name in waiting:  # it grows
-        body = getattr(repo.tree(name), "body", ())
-        for node in (each for each in body if isinstance(each, ast.Import | ast.ImportFrom)):
-            at, names = repo.at(name, node.lineno), _own_imports(repo, name, node)
-            for each in (each for each in names if repo.path(each) and repo.tree(each) is None):
-                yield f"imports {each}, which is no valid Python ({at})"
-            for each in (each for each in names[:1] if each.split(".")[0] in own):
-                path = each.replace(".", "/")
-                if not ((repo.root / path).is_dir() or any(repo.root.glob(f"{path}.*"))):
-                    yield f"imports {each}, which is not there ({at})"
-            waiting += [each for each in names if each not in waiting]
 
 
 def learning(tree: ast.AST | None) -> list[ast.FunctionDef]:
@@ -253,58 +127,15 @@ def learning(tree: ast.AST | None) -> list[ast.FunctionDef]:
     return [f for f in found if any(getattr(n, "attr", "") == "backward" for n in nodes(f))]
 
 
-def _left_out(repo: HostRepo, scripts: Iterable[str]) -> Iterator[str]:
-    """Rows of the model that its PLY lacks, always or by what a call of ``save_ply`` names."""
-    save = repo.function(MODEL, "GaussianModel.save_ply")
-    taken = repo.parameters(MODEL, "GaussianModel.save_ply") or ()
-    trees = map(repo.tree, ("scene", *map(module_of, scripts)))
-    calls = [each for tree in trees for each in every(tree, ast.Call)]
-    saving = [passed(each, taken) for each in calls if getattr(each.func, "attr", "") == "save_ply"]
-    named = {name for each in saving for name, value in each.items() if not is_off(value)}
-    off = off_by_default(save) - named if save else set()
-    gone = skipped(save, lambda node: [None] if getattr(node, "id", "") in off else [])
-    counted = [text_of(e.target) for e in every(save, ast.For) if "range(" in text_of(e.iter)]
-    for each in (e for e in every(save, ast.Subscript) if text_of(e.slice) not in counted):
-        if each not in gone and (of := chosen(each)) and _ROWS.fullmatch(text_of(of)):
-            yield f"save_ply leaves out rows, {text_of(each)} ({repo.at(MODEL, each.lineno)})"
-
-
-_ROWS = re.compile(r"xyz|attributes|elements|self\.(_|get_)xyz(\.\w+\(\))*")
-"""The positions of a model, or all its values, in its save function."""
-
-
-def _drawn_elsewhere(repo: HostRepo, module: str) -> Iterator[str]:
-    """Functions beside ``gaussian_renderer`` by which a script draws, where that has its own, and
-    functions in it without a rasterizer of 3DGS that draw in the place of others.
-    """
-    usual, known = "gaussian_renderer", as_options(repo, ("arguments", module))
-    for node in every(repo.tree(module), ast.ImportFrom):
-        beside = repo.absolute(module, node)
-        for body in (repo.function(usual, each.name) for each in node.names if beside == usual):
-            gone = skipped(body, known)
-            for made in (each for each in every(body, ast.Return) if each not in gone):
-                name = getattr(getattr(made.value, "func", None), "id", "")
-                other, given = repo.function(usual, name), repo.parameters(usual, name) or ()
-                shown = [text_of(each).split(".clamp(")[0] for each in entries(other, "render")]
-                alone = "GaussianRasteriz" not in text_of(other)
-                if alone and any(each not in given for each in shown):  # or it was drawn before
-                    yield f"{name}, which calls no rasterizer of 3DGS"
-        for each in node.names if beside != usual else ():
-            home, found = _definition(repo, beside, each.name)
-            own = _definition(repo, usual, each.name)[0]
-            if own and home != own and "GaussianRasterizer(" in text_of(found):
-                yield f"{each.name} of {home}, not of {usual}"
-
-
 @lru_cache(maxsize=64)
 def home_of(repo: HostRepo, module: str) -> str:
     """The module of the checkout that defines what a module calls GaussianModel; "" if unknown."""
-    return _definition(repo, module, "GaussianModel")[0]
+    return definition_of(repo, module, "GaussianModel")[0]
 
 
 def class_of(model: ModelClass) -> ast.stmt | None:
     """The definition of a model's class."""
-    return _definition(model.repo, model.module, model.name)[1]
+    return definition_of(model.repo, model.module, model.name)[1]
 
 
 def owners(tree: ast.AST | None) -> set[str]:
@@ -313,159 +144,7 @@ def owners(tree: ast.AST | None) -> set[str]:
     return {text_of(a).split("[")[0] for a, b in pairs if "GaussianModel(" in text_of(b)}
 
 
-@lru_cache(maxsize=64)  # of the adapters, many ask
-def _misfits(repo: HostRepo, module: str) -> tuple[str, ...]:
-    """Calls of the checkout's own functions with values that these do not take, and of methods
-    that the model lacks; without those that a script tries, or makes only where something is
-    given or asked for.
-    """
-    tree, misfits = repo.tree(module), tuple[str, ...]()
-    asked = [
-        each
-        for each in every(tree, ast.If)
-        if isinstance(each.test, ast.Name) or "hasattr(" in text_of(each.test)
-    ]
-    parts = [*(each.body for each in asked), *(each.body for each in every(tree, ast.Try))]
-    tried = {inner for part in parts for each in part for inner in nodes(each)}
-    model = _definition(repo, MODEL, "GaussianModel")[1]
-    pairs = [(text_of(to), text_of(value)) for to, value in assigned(tree)]
-    models = {to for to, value in pairs if value.startswith("GaussianModel(")}
-    models -= {to for to, value in pairs if not value.startswith("GaussianModel(")}
-    gone = tried | skipped(tree, as_options(repo, ("arguments", module))).keys()
-    texts = text_of(tree) + text_of(model)
-    calls = [each for each in every(tree, ast.Call) if each not in gone]
-    for node in sorted(calls, key=lambda each: (each.lineno, each.col_offset)):
-        owner, _, name = text_of(node.func).rpartition(".")
-        found, at = None, repo.at(module, node.lineno)
-        if name in ("capture", "restore"):
-            continue
-        if owner in models and isinstance(model, ast.ClassDef):
-            found = next((n for n in model.body if getattr(n, "name", "") == name), None)
-            inherits = model.bases or "setattr(" in texts or f".{name} = " in texts
-            if found is None and not inherits:
-                misfits += (f"calls {name}, which its model lacks ({at})",)
-        elif not owner and _bindings(tree)[name] == 1:
-            found = model if name == "GaussianModel" else _definition(repo, module, name)[1]
-        if why := _misfit(found, node, bool(owner)):
-            misfits += (f"its call of {name} {why}, which fails ({at})",)
-    return misfits
-
-
-_OURS = ("source_path", "model_path", "iterations", "checkpoint_iterations", "start_checkpoint")
-"""Options of a command that a run, or whoever starts it, relies on."""
-
-
-def _own_options(repo: HostRepo, module: str) -> Iterator[str]:
-    """Options that a script sets whatever its command says: one of ours, or all that a file has."""
-    tree = repo.tree(module)
-    body = getattr(tree, "body", ())
-    asked = [node for node in body if isinstance(node, ast.If)]
-    main = [each for node in asked if "__name__" in text_of(node.test) for each in node.body]
-    known = as_options(repo, ("arguments", module))
-    for node in (*body, *main):
-        at = repo.at(module, node.lineno)
-        if isinstance(node, ast.For) and _sets_any(node, skipped(tree, known)):
-            yield f"sets options by {text_of(node.iter)}, whatever its command says ({at})"
-        if not isinstance(node, ast.Assign):
-            continue
-        name = getattr(node.targets[0], "attr", "")
-        if name in _OURS and f".{name}" not in text_of(node.value):
-            yield f"sets {name} itself, whatever its command says ({at})"
-        called = getattr(getattr(node.value, "func", None), "id", "")
-        made = _definition(repo, module, called)[1]
-        if isinstance(made, ast.FunctionDef) and _sets_any(made, skipped(made, known)):
-            yield f"sets options by {called}, whatever its command says ({at})"
-
-
-def overruling(repo: HostRepo, module: str) -> frozenset[str]:
-    """Options, off by default, under which a script sets others whatever its command says."""
-    tree, known = repo.tree(module), as_options(repo, ("arguments", module))
-    imports = every(tree, ast.ImportFrom)
-    homes = {each.name: repo.absolute(module, node) for node in imports for each in node.names}
-    found = frozenset[str]()
-    for node, test in skipped(tree, known).items():
-        name = getattr(getattr(node, "func", None), "id", "")
-        made = repo.function(homes.get(name, module), name) if name else None
-        if name == "setattr" or (made and _sets_any(made, {})):
-            found |= options_of(test, known)
-    return found
-
-
-def _sets_any(tree: ast.AST, gone: Mapping[ast.AST, ast.expr]) -> bool:
-    """Whether code sets attributes by the names that it reads, or returns a namespace of them."""
-    calls = {*every(tree, ast.Call)} - gone.keys()
-    returned = [each.value for each in every(tree, ast.Return)]
-    return any(
-        text_of(each.func) == "setattr" or (each in returned and "Namespace(**" in text_of(each))
-        for each in calls
-    )
-
-
-_ANY = "any key"
-
-
-@lru_cache(maxsize=64)  # of the adapters, many ask
-def _absent(repo: HostRepo, module: str) -> tuple[str, ...]:
-    """Values that a script takes by name of what it drew, and that the drawing does not name."""
-    tree, said, absent = repo.tree(module), dict[str, set[str]](), tuple[str, ...]()
-    names = {
-        each.asname or each.name: each.name
-        for node in every(tree, ast.ImportFrom)
-        for each in (node.names if node.module == "gaussian_renderer" else ())
-    }
-    for to, value in assigned(tree):
-        name = names.get(getattr(getattr(value, "func", None), "id", ""), "")
-        said.setdefault(text_of(to), set()).update(_given(repo, name) or {_ANY})
-    for node in every(tree, ast.Call):  # what a script adds by another way than an item
-        said.setdefault(text_of(node.func).removesuffix(".update"), set()).add(_ANY)
-    gone = skipped(tree, as_options(repo, ("arguments", module)))
-    items = [each for each in nodes(tree) if each not in gone and _key(each)]
-    own = {_key(each) for each in items if isinstance(getattr(each, "ctx", None), ast.Store)}
-    for each in (each for each in items if isinstance(each, ast.Subscript)):
-        known = said.get(text_of(each.value), {_ANY}) | own
-        if _ANY not in known and _key(each) not in known:
-            at = repo.at(module, each.lineno)
-            absent += (f"reads {_key(each)} of what it drew, which has no such value ({at})",)
-    return absent
-
-
-def _given(repo: HostRepo, name: str) -> set[str]:
-    """Texts in a drawing function, the keys of its dict among them; empty if it may add others."""
-    body = repo.function("gaussian_renderer", name) if name else None
-    pairs = list(assigned(body))
-    named = {text_of(node.value) for node in every(body, ast.Return) if node.value}
-    made = [value for to, value in pairs if text_of(to) in named]
-    made += [node.value for node in every(body, ast.Return) if isinstance(node.value, ast.Dict)]
-    for node in every(body, ast.Call):
-        owner, _, method = text_of(node.func).rpartition(".")
-        made += node.args if owner in named and method == "update" else []
-    texts = {str(each.value) for each in every(body, ast.Constant)}
-    dicts = [each for each in made if isinstance(each, ast.Dict) and None not in each.keys]
-    calls = any(isinstance(node.value, ast.Call) for node in every(body, ast.Return))
-    known = "render" in texts and dicts and len(dicts) == len(made) and not calls
-    return texts if known else set()
-
-
-def _key(node: ast.AST) -> str:
-    """The text by which an item is taken; "" if none is."""
-    value = getattr(node.slice, "value", None) if isinstance(node, ast.Subscript) else None
-    return value if isinstance(value, str) else ""
-
-
-@lru_cache(maxsize=64)
-def _bindings(tree: ast.AST | None) -> Counter[str]:
-    """How often a module gives something a name."""
-    kinds = ("name", "asname", "arg", "id")
-    return Counter(
-        name
-        for node in nodes(tree)
-        if not isinstance(node, ast.keyword)
-        and isinstance(getattr(node, "ctx", ast.Store()), ast.Store)
-        for name in {str(getattr(node, kind, None)) for kind in kinds}
-    )
-
-
-def _definition(
+def definition_of(
     repo: HostRepo, module: str, name: str, deep: int = 3
 ) -> tuple[str, ast.stmt | None]:
     """The function or class of a name in a module, also one that it imports from the checkout, with
@@ -476,74 +155,8 @@ def _definition(
             return module, node
         for each in node.names if isinstance(node, ast.ImportFrom) and deep else ():
             if (each.asname or each.name) == name:
-                return _definition(repo, repo.absolute(module, node), each.name, deep - 1)
+                return definition_of(repo, repo.absolute(module, node), each.name, deep - 1)
     return "", None
-
-
-def _misfit(called: ast.AST | None, call: ast.Call, of_model: bool) -> str:
-    """How a call's values differ from those that a function, a method or a class takes; "" if they
-    do not, or if that cannot be told.
-    """
-    made = isinstance(called, ast.ClassDef)
-    own = [n for n in getattr(called, "body", ()) if getattr(n, "name", "") == "__init__"]
-    function = (own[0] if own else None) if made else called
-    given = [each.arg for each in call.keywords]
-    loose = None in given or any(isinstance(each, ast.Starred) for each in call.args)
-    if not isinstance(function, ast.FunctionDef) or function.decorator_list or loose:
-        return ""
-    taken, count = function.args, len(call.args)
-    names = [each.arg for each in (*taken.posonlyargs, *taken.args)]
-    needed = names[: len(names) - len(taken.defaults)]
-    names, needed = (each[made or of_model :] for each in (names, needed))
-    free = [*names[count:], *(each.arg for each in taken.kwonlyargs)]
-    if count > len(names) and not taken.vararg:
-        return f"gives {count} values of {len(names)}"
-    more = [each for each in given if each not in free and not taken.kwarg]
-    lacking = [each for each in needed[count:] if each not in given]
-    return f"gives {more[0]}" if more else f"lacks {lacking[0]}" if lacking else ""
-
-
-_COMPARED = {
-    **{ast.Eq: operator.eq, ast.NotEq: operator.ne, ast.Gt: operator.gt, ast.GtE: operator.ge},
-    **{ast.Lt: operator.lt, ast.LtE: operator.le, ast.Is: operator.is_, ast.IsNot: operator.is_not},
-}
-
-
-Known = Callable[[ast.AST], list[Any]]
-"""The one value of an expression; [] if it is not known."""
-
-
-def skipped(tree: ast.AST | None, known: Known) -> dict[ast.AST, ast.expr]:
-    """What code does not do by the values that are known: nodes, with the test before each."""
-    found: dict[ast.AST, ast.expr] = {}
-    branching: tuple[Any, ...] = every(tree, ast.If, ast.IfExp)
-    for node in branching:
-        taken = decided(node.test, known)
-        branch = None if taken is None else node.orelse if taken else node.body
-        for each in branch if isinstance(branch, list) else [branch]:
-            found |= dict.fromkeys(nodes(each), node.test)
-    return found
-
-
-def decided(test: ast.expr, known: Known) -> bool | None:
-    """What a test says by the values that are known; None if it asks for anything else."""
-    if isinstance(test, ast.BoolOp):
-        parts = [decided(each, known) for each in test.values]
-        ends = isinstance(test.op, ast.Or)
-        return ends if ends in parts else None if None in parts else not ends
-    if isinstance(test, ast.UnaryOp) and isinstance(test.op, ast.Not):
-        inner = decided(test.operand, known)
-        return None if inner is None else not inner
-    sides = [test.left, *test.comparators] if isinstance(test, ast.Compare) else [test]
-    values = [known(each) or _one([each]) for each in sides]
-    if not all(values) or not any(map(known, sides)):
-        return None
-    if not isinstance(test, ast.Compare):
-        return bool(values[0][0])
-    compared = _COMPARED.get(type(test.ops[0]))
-    with contextlib.suppress(TypeError):
-        return bool(compared(values[0][0], values[1][0])) if compared and len(sides) == 2 else None
-    return None
 
 
 def as_options(repo: HostRepo, modules: Collection[str]) -> Known:
@@ -567,16 +180,7 @@ def _option(node: ast.AST) -> str:
 
 def by_default_of(repo: HostRepo, modules: Collection[str], option: str) -> list[Any]:
     """The one value that modules give an option by default; [] if it is not known."""
-    return _one([value for module in modules for value in defaults(repo, module, option)])
-
-
-def _one(given: list[Any]) -> list[Any]:
-    """The value of expressions that are one and the same constant; [] if they are not."""
-    try:
-        values = [ast.literal_eval(each) for each in given]
-    except (ValueError, TypeError, SyntaxError):
-        return []
-    return values[:1] if all(repr(each) == repr(values[0]) for each in values) else []
+    return constant([value for module in modules for value in defaults(repo, module, option)])
 
 
 def module_of(script: str) -> str:
@@ -689,11 +293,11 @@ def reached(repo: HostRepo, modules: Iterable[str], without: str = "") -> dict[s
         seen[module] = tree
         statements: tuple[Any, ...] = every(tree, ast.Import, ast.ImportFrom)
         for node in statements:
-            waiting += _own_imports(repo, module, node)
+            waiting += own_imports(repo, module, node)
     return seen
 
 
-def _own_imports(repo: HostRepo, module: str, node: ast.Import | ast.ImportFrom) -> list[str]:
+def own_imports(repo: HostRepo, module: str, node: ast.Import | ast.ImportFrom) -> list[str]:
     """What a statement may import of the host: beside an installed one lie all other packages."""
     names = repo.imported_by(module, node)
     return [each for each in names if repo.package in ("", each.split(".")[0])]
@@ -798,3 +402,17 @@ def _of_groups(repo: HostRepo) -> Iterator[str]:
             yield f"--{each.attr.removeprefix('_')}"
             if each.attr.startswith("_"):
                 yield f"-{each.attr[1]}"
+
+
+def training_modules(repo: HostRepo) -> list[str]:
+    """Modules of the scripts that train, by their names, or else by what they do."""
+    named = sorted(each.stem for each in repo.root.glob("*train*.py") if each.stem.isidentifier())
+    return named or [*map(module_of, training_scripts(repo))]
+
+
+@lru_cache(maxsize=16)
+def texts_of(repo: HostRepo) -> dict[Path, str]:
+    """The files of a codebase that may draw or save its model, with their text."""
+    paths = [path for each in ("", "*/", "*/*/") for path in sorted(repo.root.glob(f"{each}*.py"))]
+    texts = {each: repo.read(each) for each in paths}
+    return {k: v for k, v in texts.items() if k.parent.name != "scene" or "def save" not in v}
