@@ -1,6 +1,6 @@
 """graphdeco-inria/gaussian-splatting and its forks: the adapter of forks that have no other one.
 
-What it needs it reads from the checkout (``fork``). It serves a fork whose model is plain 3DGS: the
+What it needs it reads from the checkout (``read``). It serves a fork whose model is plain 3DGS: the
 parameters' own activations are drawn, by the known kernel. Values that a rasterizer returns besides
 are made if their kernel was read; those that nobody reads raise if they are read after all.
 """
@@ -16,19 +16,11 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import fragprune_graphdeco as graphdeco
-from fragprune_3dgs_fork.fork import (
-    CHECKPOINT,
-    CLASS,
-    HANDED,
-    MODEL,
-    RENDERER,
-    Fork,
-    plain_distances,
-    read_fork,
-    read_getters,
-    rests_after_densification,
-)
+from fragprune_3dgs_fork.draws import HANDED
+from fragprune_3dgs_fork.fork import CHECKPOINT, CLASS, MODEL, RENDERER, Fork
+from fragprune_3dgs_fork.methods import plain_distances, read_getters, rests_after_densification
 from fragprune_3dgs_fork.rasterizer import POSES, Output
+from fragprune_3dgs_fork.read import read_fork
 from fragprune_graphdeco import (
     SCREEN,
     GraphdecoAdapter,

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 import fragprune_graphdeco as graphdeco
 from fragprune_3dgs_fork import ForkAdapter
-from fragprune_3dgs_fork.fork import STATISTICS, read_fork
+from fragprune_3dgs_fork.methods import STATISTICS
+from fragprune_3dgs_fork.read import read_fork
 from fragprune_graphdeco import GraphdecoAdapter, RasterizerCall, reading
 from fragprune_plugins.adapting import (
     Finding,

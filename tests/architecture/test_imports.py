@@ -118,7 +118,10 @@ KNOWN = {
     "fragprune_plugins": {"reference_renderer"},
     "fragprune_graphdeco": {"fragprune_plugins.adapting", "fragprune_plugins.learning.losses"},
     # what its forks do otherwise is theirs
-    "fragprune_vanilla_3dgs": {*OF_ADAPTERS, "fragprune_3dgs_fork", "fragprune_3dgs_fork.fork"},
+    "fragprune_vanilla_3dgs": {
+        *OF_ADAPTERS,
+        *("fragprune_3dgs_fork", "fragprune_3dgs_fork.methods", "fragprune_3dgs_fork.read"),
+    },
     # its host moves in time
     "fragprune_rt_4dgs": {
         *OF_ADAPTERS,

@@ -9,7 +9,7 @@ from core.test_verdict import judged
 from miniatures.forks import RENDER, fork
 
 from fragprune_3dgs_fork import ForkAdapter, Unread
-from fragprune_3dgs_fork.fork import read_fork
+from fragprune_3dgs_fork.read import read_fork
 from fragprune_graphdeco import plain
 from fragprune_plugins.adapting import EngineError, HostCall, NotComparedError, Role, UsageError
 from fragprune_plugins.hosts.choosing import choose

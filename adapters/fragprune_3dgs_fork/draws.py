@@ -1,0 +1,230 @@
+"""How a fork draws: its functions, the calls of the rasterizer, and what its values are."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from functools import partial
+
+import fragprune_graphdeco as graphdeco
+from fragprune_3dgs_fork import rasterizer
+from fragprune_3dgs_fork.fork import CAMERA, MODEL, RENDERER, Draw, Fork, mentioned, method_calls
+from fragprune_3dgs_fork.rasterizer import Output
+from fragprune_graphdeco import (
+    Drawing,
+    arguments,
+    assigned,
+    every,
+    kernels,
+    reading,
+    syntax,
+    text_of,
+)
+from fragprune_plugins.adapting import is_off, nodes, off_by_default
+
+_MODEL_ARGUMENTS = ("pc", "gaussians", "gaussian", "model")
+NEUTRAL = {"antialiasing", "confidence", "projmatrix_raw"}
+"""Further settings that the engines know, or that are checked to be neutral at every call."""
+HANDED = ("detach", "clone", "contiguous", "squeeze", "unsqueeze")
+"""Methods of a value that nobody reads yet: it is handed on in another shape."""
+_PROVABLE = re.compile(r"^(?!.*(median|max|normal|var|dist)).*(depth|alpha|acc|opac)")
+"""Names of values that a proof can tell, if they are what they are called."""
+
+
+def read_draws(fork: Fork) -> None:
+    """The drawing functions that a script names, and their calls."""
+    functions, repo = fork.drawing, fork.repo
+    drawing = [each for each in fork.trees.values() if not mentioned(each).isdisjoint(functions)]
+    named = {name for tree in drawing for name in _reached(fork, tree)}
+    pairs = ((name, repo.function(RENDERER, name)) for name in functions)
+    drawn = {name: body for name, body in pairs if body}
+    while more := {n for name in drawn.keys() & named for n in mentioned(drawn[name])} - named:
+        named |= more
+    bodies = {name: body for name, body in drawn.items() if name in named}
+    trees = (*fork.trees.values(), *bodies.values())
+    called = {getattr(n, "id", getattr(n, "attr", "")) for each in trees for n in nodes(each)}
+    for name, body in bodies.items():
+        parameters = repo.parameters(RENDERER, name) or ()
+        model = next((each for each in _MODEL_ARGUMENTS if each in parameters), "")
+        at = f"{RENDERER}:{name} ({repo.place(RENDERER, name)})"
+        refuse = partial(fork.refuse, "rasterizer-call", at)
+        calls = tuple(graphdeco.read_calls(repo, RENDERER, name))
+        others = [each for each in parameters if each != model]
+        camera = next((each for each in others if CAMERA.match(each)), next(iter(others), ""))
+        if not model or not camera or parameters.index(model) < parameters.index(camera):
+            refuse(f"arguments {', '.join(parameters)}", "a camera and a model")
+            continue
+        if not calls or not all(call.names for call in calls):
+            refuse("a result that is not unpacked", "its values")
+            continue
+        fork.draws += (Draw(name, camera, model, calls),)
+        source = Drawing(repo, RENDERER, body)
+        filled = {getattr(each.value, "id", "") for each in every(body, ast.Subscript)}
+        for call in calls:
+            _check_call(fork, at, name, call)
+            blended = text_of(call.given.get(fork.blended.get(call.package, "")))
+            made = " ".join(map(text_of, source.values.get(blended, [])))
+            if blended not in filled and re.search(r"torch\.(zeros|empty)\(", made):
+                refuse(f"{blended}, which is empty unless asked for", "channels of every Gaussian")
+        for node in every(body, ast.Call) if name in called else ():
+            if "means3D" in arguments(node):
+                other = Drawing(repo, RENDERER, body, call=node)
+                for found in (why for why, moves in other.shapes() if not moves):
+                    refuse(found, "the model's own Gaussians")
+                if selected := other.selection():
+                    refuse(f"draws a selection, {selected}", "all rows")
+        for cut in [*source.cuts()][:1]:
+            refuse(f"a picture of more channels, {text_of(cut)}", "a picture")
+        fork.colours |= source.colours
+    if not fork.draws and not any(each.code == "rasterizer-call" for each in fork.findings):
+        at = f"{RENDERER} ({repo.place(RENDERER, 'render')})"
+        fork.refuse("rasterizer-call", at, "no drawing function that a script calls", "render")
+
+
+def _reached(fork: Fork, node: ast.AST) -> Iterator[str]:
+    """Names and imports in a script, without those under an option that is off by default."""
+    for kind in ("id", "attr", "name"):
+        if isinstance(name := getattr(node, kind, None), str):
+            yield name
+    for each in ast.iter_child_nodes(node):
+        if each in fork.optional:
+            if not mentioned(each).isdisjoint(fork.drawing):
+                fork.options |= fork.optional[each]
+            continue
+        yield from _reached(fork, each)
+
+
+def _check_call(fork: Fork, at: str, function: str, call: graphdeco.CallInSource) -> None:
+    """Settings and arguments besides the known ones: off, or without a part in the picture."""
+    if blended := rasterizer.blended_argument(fork.repo, call):
+        fork.blended[call.package] = blended
+    if call.other_matrix:
+        found = f"projmatrix is {call.other_matrix}"
+        fork.refuse("rasterizer-call", at, found, "the cameras of 3DGS")
+    if rasterizer.POSES & call.arguments:
+        fork.warn("rasterizer-call", at, "the cameras, which stand still in stage 2")
+    screens = frozenset(filter(rasterizer.SCREEN.fullmatch, call.arguments))
+    fork.screens |= screens
+    given = call.arguments - rasterizer.SERVED - screens - {blended}
+    further = [*(call.besides - NEUTRAL), *given]
+    unknown = {each for each in further if not _stays_off(fork, function, call.given.get(each))}
+    fork.off |= {*further} - unknown
+    for name in sorted(unknown & call.besides):
+        changed = rasterizer.changed_gradients(fork.repo, call.package, name)
+        if rasterizer.only_asks(fork.repo, call.package, name):
+            unknown.remove(name)
+            fork.asking |= {name}
+        elif changed is not None and changed <= {"means2D"}:
+            unknown.remove(name)
+            fork.scaled |= {name}
+            fork.warn("rasterizer-call", at, f"the gradient on the screen, which {name} changes")
+    if unknown:
+        found = f"{', '.join(sorted(unknown))}, unknown to fragprune"
+        fork.refuse("rasterizer-call", at, found, "settings and arguments whose effect is known")
+
+
+def _stays_off(fork: Fork, function: str, value: ast.expr | None) -> bool:
+    """Whether a value is None or False unless a user asks for more; every call is checked."""
+    body = fork.repo.function(RENDERER, function)
+    if isinstance(value, ast.Attribute):
+        return reading.off_in(fork.repo, (MODEL, *fork.command), value.attr)
+    if not isinstance(value, ast.Name) or body is None:
+        return is_off(value)
+    names = fork.repo.parameters(RENDERER, function) or ()
+    if value.id not in off_by_default(body):
+        return False
+    calls = [node for tree in fork.trees.values() for node in every(tree, ast.Call)]
+    own = [getattr(each.func, "id", "") == function for each in calls]
+    given = [syntax.passed(each, names if by else ()) for each, by in zip(calls, own, strict=True)]
+    return all(_stays_off(fork, "", each.get(value.id, ast.Constant(None))) for each in given)
+
+
+def read_outputs(fork: Fork) -> None:
+    """What each rasterizer returns; refused where a value is read and its meaning is unknown."""
+    for draw, call in ((each, call) for each in fork.draws for call in each.calls):
+        roles = tuple(_output(fork, draw, call, number) for number in range(len(call.names)))
+        known = fork.outputs.get(call.package, roles)
+        if len(known) != len(roles):
+            at, found = fork.repo.at(RENDERER, call.line), f"{len(roles)} and {len(known)} values"
+            fork.refuse("rasterizer-call", at, found, "one form")
+            continue
+        fork.outputs[call.package] = tuple(
+            each if each.role != "unread" else former
+            for each, former in zip(roles, known, strict=True)
+        )
+    for package, roles in fork.outputs.items():
+        names = [each.role for each in roles]
+        if names[:1] != ["image"] or names.count("radii") != 1:
+            found = f"values {', '.join(each.name or '?' for each in roles)}"
+            fork.refuse("rasterizer-output", package, found, "a picture, and the radii once")
+
+
+def _output(fork: Fork, draw: Draw, call: graphdeco.CallInSource, number: int) -> Output:
+    name, package = call.names[number], call.package
+    if number == 0:
+        return Output(name, "image")
+    if "radii" in name:
+        return Output(name, "radii")
+    output = rasterizer.meaning(fork.repo, call, name)
+    uses = _uses(fork, draw, name) if output.role in ("unread", "unproved") else {}
+    read = output.role == "unread" and kernels.normal_sources(fork.repo, package)
+    at = fork.repo.at(RENDERER, call.line)
+    if uses and _PROVABLE.search(name) and not read:
+        fork.warn("rasterizer-output", at, f"what {package} returns as {name}")
+        return Output(name, "unproved")
+    if uses and fork.early.issuperset(uses):
+        fork.warn(
+            "rasterizer-output",
+            at,
+            f"{name}, by which it densifies and which only its own rasterizer gives",
+        )
+    elif uses:
+        places = [place for node, place in uses.items() if node not in fork.early]
+        found = f"{name}, read in {places[0]}, whose meaning is unknown"
+        expected = "picture, radii, and sums along the ray whose kernel was read"
+        at = f"{RENDERER}:{draw.function} ({at})"
+        fork.refuse("rasterizer-output", at, found, expected)
+    return output if output.role != "unproved" else Output(name, "unread")
+
+
+def _uses(fork: Fork, draw: Draw, name: str) -> dict[ast.AST, str]:
+    """What reads an output, and where: in its function, or by its key where scripts draw."""
+    body = fork.repo.function(RENDERER, draw.function)
+    if body is None or name in ("", "_"):
+        return {}
+    keys, handed = set[str](), set[ast.AST]()
+    dicts = every(body, ast.Dict)
+    pairs = [pair for each in dicts for pair in zip(each.keys, each.values, strict=True)]
+    pairs += [(to.slice, value) for to, value in assigned(body) if isinstance(to, ast.Subscript)]
+    for key, value in pairs:
+        while isinstance(value, ast.Call) and getattr(value.func, "attr", "") in HANDED:
+            value = value.func.value  # type: ignore[attr-defined]
+        if isinstance(key, ast.Constant) and getattr(value, "id", "") == name:
+            keys.add(str(key.value))
+            handed.add(value)
+    places: dict[ast.AST, str] = {
+        node: fork.repo.at(RENDERER, node.lineno)
+        for node in every(body, ast.Name)
+        if node.id == name and isinstance(node.ctx, ast.Load) and node not in handed
+    }
+    for module, tree in fork.trees.items():
+        still = (node for node, method in method_calls(tree) if method in fork.still)
+        passed = {inner for node in still for inner in nodes(node)}
+        named = ((to, value) for to, value in assigned(tree) if isinstance(to, ast.Name))
+        given: dict[ast.AST, str] = {value: to.id for to, value in named}
+        loads = [n for n in every(tree, ast.Name) if isinstance(n.ctx, ast.Load)]
+        for node in nodes(tree):
+            read = isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Load)
+            index = node.slice if read else None  # type: ignore[attr-defined]
+            if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "get":
+                index = node.args[0] if node.args else None
+            if getattr(index, "value", None) not in keys or not keys or node in passed:
+                continue
+            own = [n for n in loads if n.id == given[node]] if node in given else [node]
+            for each in (n for n in own if n not in passed):
+                if optional := fork.optional.get(each, fork.optional.get(node)):
+                    fork.options |= optional
+                else:
+                    places[each] = fork.repo.at(module, each.lineno)  # type: ignore[attr-defined]
+    return places
