@@ -31,6 +31,7 @@ from fragprune_graphdeco import (
     warn_once,
 )
 from fragprune_plugins.adapting import (
+    NEAR,
     CommandLine,
     EngineError,
     Finding,
@@ -119,7 +120,8 @@ class ForkDialect(GraphdecoDialect):
 
         if not call.still and call["means2D"].shape[1] > SCREEN:
             self._refuse("means2D", "absolute screen gradients", "three columns, or stage 2")
-        fork, inputs = self.fork, super().unpack(call)
+        fork, near = self.fork, kernels.near(self.fork.repo, call.entry.split(":")[0])
+        inputs = replace(super().unpack(call), near=NEAR if near is None else near)
         confidence = getattr(call.settings, "confidence", None)
         if confidence is not None and not bool((confidence == 1).all()):
             self._refuse("confidence", "values other than 1", "1 everywhere, which changes nothing")
@@ -292,9 +294,11 @@ class ForkAdapter(GraphdecoAdapter):
         fork = read_fork(repo)
         served = replace(self.command_line(repo), scripts=fork.scripts)
         kernel = partial(kernels.read_kernels, repo, kernel=kernels.SPLAT)
+        several = [each for each in fork.outputs if kernels.near(repo, each) is None]
+        codes = (kernels.ORDER, kernels.NEAR)[: 1 + bool(several)]
         return [
             *fork.findings,
-            *(f for found in map(kernel, fork.outputs) for f in found if f.code == kernels.ORDER),
+            *(f for found in map(kernel, fork.outputs) for f in found if f.code in codes),
             *read_getters(fork),
             *(reading.read_flags(repo, served) if fork.scripts else ()),
             *self._groups(repo),
@@ -309,6 +313,12 @@ class ForkAdapter(GraphdecoAdapter):
             for each in self.groups
             if each.name not in found
         ]
+
+    def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any]:
+        """Likewise, from the distance on from which its rasterizer draws."""
+        call = self._first_call(repo)
+        near = kernels.near(repo, call.package) if call else None
+        return super().drawing(repo, arguments) | ({} if near in (None, NEAR) else {"near": near})
 
     def seams_for(self, repo: HostRepo) -> tuple[Seam, ...]:
         """The seams at what the checkout has."""

@@ -25,10 +25,11 @@ _BLENDS = re.compile(r"1(?:\.0?f?)?\s*-\s*alpha\b|\balpha\s*<\s*1")
 _BRANCHES = re.compile(r"\balpha\s*=(?!=)([^;]+);")  # of an alpha that is declared without a value
 _JACOBIAN = re.compile(r"\bJ\s*=\s*glm::mat3(?:x3)?\s*(\([^;]+\))\s*;")
 _FILTER = re.compile(r"\bcov(?:\[(?:0\]\[0|1\]\[1)\]|\.x|\.z)\s*\+=?\s*(?!cov\b)([\w.]+)")
+_NEAREST = "Gaussians nearer than"
 _NUMBERS = {
     "fragments fainter than": (r"\balpha<\(?([\d.]+(?:/[\d.]+)?)\)?", 1 / 255),
     "no light below": (r"\btest_T<([\d.]+)\)\{?done=true", 1e-4),
-    "Gaussians nearer than": (r"\bp_view\.z<=?([\d.]+)", 0.2),
+    _NEAREST: (r"\bp_view\.z<=?([\d.]+)", 0.2),
     "Gaussians beyond this times their deviation:": (r"\bceil\(([\d.]+)\*sqrt\(", 3),
     "projections beyond this times the view:": (r"lim[xy]=([\d.]+)\*tan_fov", 1.3),
 }
@@ -57,7 +58,8 @@ _POLYNOMIAL = re.compile(r"[\w.+()-]*(?:\*[\w.+()-]+){5,}")
 _LAUNCH = re.compile(r"\b(\w+)\s*(?:<[^<>;]*>)?\s*<<\s*<")
 _KERNEL = re.compile(r"__global__[^;{(]*?(?:__launch_bounds__\s*\([^)]*\)\s*)?(\w+)\s*\(")
 _LOW_PASS = 0.3
-ORDER = "order"  # the code of an error that is of the picture alone: a PLY is drawn in any order
+# codes of errors that are of the picture alone: a PLY is drawn in any order, and from any distance
+ORDER, NEAR = "order", "near"
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,17 @@ def normal_sources(repo: HostRepo, package: str) -> list[str]:
     """The CUDA sources of a vendored rasterizer that draw, in one spelling; empty without any."""
     texts = (text for project in _projects(repo, package) for text in project.texts.values())
     return [*map(_normal, texts)]
+
+
+@lru_cache(maxsize=64)  # every call asks
+def near(repo: HostRepo, package: str) -> float | None:
+    """The view depth up to which a rasterizer leaves out Gaussians: that of 3DGS where it was not
+    read, None where its sources name several.
+    """
+    pattern, usual = _NUMBERS[_NEAREST]
+    found = [each for text in normal_sources(repo, package) for each in re.findall(pattern, text)]
+    values = {*map(float, found)} or {usual}
+    return values.pop() if len(values) == 1 else None
 
 
 def backward_sources(repo: HostRepo, package: str) -> str:
@@ -225,7 +238,8 @@ class _Project:
                     above, _, below = match[1].partition("/")
                     if not math.isclose(float(above) / float(below or 1), usual, rel_tol=0.01):
                         at = self._place(path, match[0])
-                        yield self._finding(path, at, f"{what} {match[1]}", f"{usual:.4g}")
+                        finding = self._finding(path, at, f"{what} {match[1]}", f"{usual:.4g}")
+                        yield replace(finding, code=NEAR) if what == _NEAREST else finding
             for match in _UNLIKE.finditer(normal):
                 code = match[0].lstrip(";{})")
                 found = f"it draws otherwise, {_short(code)}"

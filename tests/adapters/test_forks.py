@@ -67,6 +67,18 @@ def objects():
     return torch.rand(40, 1, OBJECTS, generator=torch.Generator().manual_seed(0))
 
 
+def test_a_call_draws_from_where_the_kernel_in_the_checkout_begins(scene, tmp_path):
+    folder = tmp_path / "submodules/p"
+    (folder / "p").mkdir(parents=True)
+    (folder / "p/__init__.py").write_text("")
+    (folder / "auxiliary.h").write_text("if (p_view.z <= 0.01f) return false;")
+    (folder / "forward.cu").write_text("")
+    for root, near in ((tmp_path, 0.01), (tmp_path / "submodules/p/p", 0.2)):
+        fork = replace(FORK, repo=HostRepo(root))
+        dialect = replace(DIALECT, fork=fork)
+        assert dialect.unpack(call_of(scene, None)).near == near
+
+
 def blended(engine, scene, channel):
     """One channel alone."""
     splats = replace(scene.splats, features=channel)

@@ -119,6 +119,18 @@ def test_gaussians_in_another_order_are_another_picture_of_a_plain_ply(tmp_path)
     assert judged(repo).kind == "finetune"
 
 
+def test_gaussians_are_drawn_from_the_distance_on_that_its_kernel_says(tmp_path):
+    nearer = "if (p_view.z <= 0.001f) return false;"
+    repo = fork(tmp_path / "one", kernel=nearer)
+    assert errors(repo) == []
+    assert ForkAdapter().drawing(repo, []) == {"near": 0.001}
+    usual = fork(tmp_path / "usual", kernel=nearer.replace("0.001", "0.2"))
+    assert ForkAdapter().drawing(usual, []) == {}
+    several = fork(tmp_path / "two", kernel=f"{nearer} {nearer.replace('0.001', '0.2')}")
+    assert "Gaussians nearer than 0.001" in "; ".join(errors(several))
+    assert judged(several).kind == "finetune"
+
+
 ONE_PASS = {
     "branches": (
         "        loss.backward()\n",
