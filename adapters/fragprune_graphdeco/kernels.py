@@ -34,6 +34,8 @@ _NUMBERS = {
     "projections beyond this times the view:": (r"lim[xy]=([\d.]+)\*tan_fov", 1.3),
 }
 """What a rasterizer leaves out or limits, and the number that it does so by."""
+_NEEDED = 3
+"""The first of these are in every rasterizer."""
 _COLOURS = re.compile(r"computeColorFromSH\([^;{]*\{(.*?)\breturn([^;]+);")
 _OF_COLOURS = r"max\(\w+,(vec3\()?0\.?0?\)?\)"
 _UNLIKE = re.compile(
@@ -230,7 +232,11 @@ class _Project:
             yield self._finding(path, position, what, kernel.says)
 
     def _numbers(self) -> Iterator[Finding]:
-        """Other numbers than those that 3DGS leaves out fragments and Gaussians by."""
+        """Other numbers than those that 3DGS leaves out fragments and Gaussians by, or none."""
+        whole = "".join(map(_normal, self.texts.values()))
+        for what, (pattern, usual) in list(_NUMBERS.items())[:_NEEDED]:
+            if not re.search(pattern, whole):
+                yield self._finding(self.folder, 0, f"no test for {what}", f"{usual:.4g}")
         for path, text in self.texts.items():
             normal = _normal(text)
             for what, (pattern, usual) in _NUMBERS.items():

@@ -120,14 +120,17 @@ def test_gaussians_in_another_order_are_another_picture_of_a_plain_ply(tmp_path)
 
 
 def test_gaussians_are_drawn_from_the_distance_on_that_its_kernel_says(tmp_path):
-    nearer = "if (p_view.z <= 0.001f) return false;"
-    repo = fork(tmp_path / "one", kernel=nearer)
-    assert errors(repo) == []
-    assert ForkAdapter().drawing(repo, []) == {"near": 0.001}
-    usual = fork(tmp_path / "usual", kernel=nearer.replace("0.001", "0.2"))
-    assert ForkAdapter().drawing(usual, []) == {}
-    several = fork(tmp_path / "two", kernel=f"{nearer} {nearer.replace('0.001', '0.2')}")
-    assert "Gaussians nearer than 0.001" in "; ".join(errors(several))
+    def drawn_from(near, *more):
+        repo = fork(tmp_path / near, kernel="".join(more) or " ")
+        source = tmp_path / near / "submodules/a/forward.cu"
+        source.write_text(source.read_text().replace("z <= 0.2f", f"z <= {near}f"))
+        return repo
+
+    assert errors(drawn_from("0.001")) == errors(drawn_from("0.2")) == []
+    assert ForkAdapter().drawing(HostRepo(tmp_path / "0.001"), []) == {"near": 0.001}
+    assert ForkAdapter().drawing(HostRepo(tmp_path / "0.2"), []) == {}
+    several = drawn_from("0.01", "if (p_view.z <= 0.3f) return;")
+    assert "Gaussians nearer than 0.01" in "; ".join(errors(several))
     assert judged(several).kind == "finetune"
 
 

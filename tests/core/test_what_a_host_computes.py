@@ -15,6 +15,7 @@ PACKAGE = "diff_gaussian_rasterization"
 PROJECTION = """
 __device__ float3 spread(float3 m, float fx, float fy, float* cov3, float* view) {
     float3 p = to_view(m, view);
+    if (p_view.z <= 0.2f) return;
     %s
     glm::mat3 M = W * J;
     glm::mat3 cov = glm::transpose(M) * V * M;
@@ -36,6 +37,7 @@ __global__ void draw(float4* conics, float2* at) {
         float4 c = conics[k];
         %s
         if (alpha < 1.0f / 255.0f) continue;
+        if (test_T < 0.0001f) { done = true; continue; }
     }
 }
 void launch() { draw <<<grid, block>>>(conics, at); }
@@ -81,7 +83,7 @@ def test_sources_that_a_file_compiles_at_import_are_read_too(tmp_path, projectio
 @pytest.mark.parametrize(
     ("changed", "says"),
     [
-        ({"projection": TANGENT}, "forward.cu:5): another projection, J = (fx*p.z*s"),
+        ({"projection": TANGENT}, "forward.cu:6): another projection, J = (fx*p.z*s"),
         ({"blend": "float alpha = min(0.99f, c.w * area(d));"}, "c.w*area(d)): no exp()"),
         (
             {"blend": "float power = -0.5f * nearest;\n float alpha = min(0.99f, exp(power));"},
@@ -342,3 +344,18 @@ def test_every_value_that_a_named_host_draws_is_its_parameter_activated(tmp_path
     assert not errors(rewritten(repo, path, "    def other", getter % activated))
     moved = rewritten(repo, path, f"return {activated}", f"return {activated} * self.spread")
     assert f"get_{kind} is computed" in errors(moved)[0]
+
+
+@pytest.mark.parametrize(
+    ("limit", "says"),
+    [
+        ("if (alpha < 1.0f / 255.0f) continue;", "no test for fragments fainter than"),
+        ("if (test_T < 0.0001f) { done = true; continue; }", "no test for no light below"),
+        ("if (p_view.z <= 0.2f) return;", "no test for Gaussians nearer than"),
+    ],
+)
+def test_one_that_leaves_out_nothing_where_3dgs_does_is_refused(tmp_path, limit, says):
+    vendor(tmp_path)
+    source = tmp_path / "submodules/a/cuda/forward.cu"
+    source.write_text(source.read_text().replace(limit, ""))
+    assert says in "; ".join(errors(skeleton(tmp_path)))

@@ -167,6 +167,11 @@ def fork(
     return HostRepo(root)
 
 
+LIMITS = """
+if (p_view.z <= 0.2f) return;
+if (alpha < 1.0f / 255.0f) continue;
+if (test_T < 0.0001f) { done = true; }
+"""
 KERNEL = """
 float power = -0.5f * (con_o.x * d.x * d.x + con_o.z * d.y * d.y) - con_o.y * d.x * d.y;
 float alpha = min(0.99f, con_o.w * exp(power));
@@ -174,5 +179,6 @@ glm::mat3 J = glm::mat3(fx / t.z, 0.0f, -(fx * t.x) / (t.z * t.z),
     0.0f, fy / t.z, -(fy * t.y) / (t.z * t.z), 0, 0, 0);
 cov[0][0] += 0.3f;
 cov[1][1] += 0.3f;
+LIMITS
 SUMS
-"""
+""".replace("LIMITS", LIMITS)
