@@ -112,7 +112,7 @@ class CudaKernels:
 
     def empty(self, *shape: int) -> Tensor:
         """An uninitialised float32 tensor of this shape on the device."""
-        return torch.empty(shape, device=self.where)
+        return torch.empty(shape, dtype=torch.float32, device=self.where)
 
     def call(self, way: Way, given: structs.Spacetime, *others: Any) -> None:
         """Cut, or go back."""

@@ -1,7 +1,8 @@
 """The emulation of a GPU with kernels of the tests' own, or with somebody who tampers with it."""
 
 import ctypes
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,5 +39,12 @@ class Watched:
         self.device.launch(where, source, macros, kernel, blocks, arguments)
         self.after(kernel, arguments)
 
-    def capturing(self, where: torch.device) -> bool:
-        return False
+
+@contextmanager
+def double_by_default() -> Iterator[None]:
+    """As a host may have it, for numbers of its own."""
+    torch.set_default_dtype(torch.float64)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(torch.float32)

@@ -10,6 +10,7 @@ from dataclasses import replace
 import pytest
 import scenes
 import torch
+from gpu.emulated import double_by_default
 from native import test_against_oracle as native
 from native.test_against_oracle import (
     check_gradients,
@@ -64,6 +65,14 @@ def test_a_soft_rim_is_refused(engine):
 def test_surfels_are_refused(engine):
     with pytest.raises(EngineError, match=r"surfels.*--device cpu"):
         engine.rasterize(scenes.random_scene(5, 20, flat=True), None)
+
+
+def test_kernels_write_single_precision_whatever_torchs_default_is(device):
+    inputs, thresholds = scenes.random_scene(0, features=3), scenes.random_thresholds(0, 60)
+    engine = CudaEngine(device, deterministic=True)
+    expected = everything(engine, inputs, thresholds)
+    with double_by_default():
+        assert_identical(expected, everything(engine, inputs, thresholds))
 
 
 def test_tiles_of_footprints_may_be_any_integers(engine):

@@ -248,6 +248,8 @@ class Drawing:
         self._device, self._inputs, self._n = device, inputs, len(inputs.splats)
         self.where = inputs.splats.device
         self._launch = partial(launch, device, self.where)
+        # what kernels write, whatever the host has made torch's default
+        self._new = partial(torch.empty, dtype=torch.float32, device=self.where)
         view = inputs.view
         self._arrays = native_arrays(inputs, thresholds, self.where)
         offsets = self._arrays.get("sample_offsets")
@@ -274,7 +276,7 @@ class Drawing:
         keep = bool(wanted)
         cleared, scratch, kept = self._room(capacity, keep, keep and deterministic)
         planes = get_args(Plane)  # the kernels spare none
-        outputs = new_outputs(inputs, partial(torch.empty, device=where), planes)
+        outputs = new_outputs(inputs, self._new, planes)
         for name in outputs.keys() & {"fragments_per_gaussian", "wins_per_gaussian"}:
             outputs[name].zero_()  # the kernels add to these
         weights = torch.zeros(n, dtype=torch.int64, device=where) if inputs.scores else None
@@ -422,11 +424,11 @@ class Drawing:
         tiles = self._across * self._down
         shapes = {name: array.shape for name, array in self._arrays.items()}
         shapes["hook"] = torch.Size((n, 3))
-        grads = {name: torch.empty(shapes[name], device=where) for name in wanted - {"background"}}
-        by_tile = torch.empty(tiles, 3, device=where) if "background" in wanted else None
+        grads = {name: self._new(shapes[name]) for name in wanted - {"background"}}
+        by_tile = self._new(tiles, 3) if "background" in wanted else None
         per_gaussian = n > 0 and bool(grads)
         rows = frame.capacity if frame.owners else n
-        room = torch.zeros(rows * sums, device=where) if per_gaussian else None
+        room = self._new(rows * sums).zero_() if per_gaussian else None
         if "features" in grads and "features" not in by:
             grads["features"].zero_()
         arguments = Undraw(
