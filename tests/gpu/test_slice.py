@@ -1,10 +1,11 @@
 """Slices of Gaussians in space and time: the kernels' own sources, emulated, against the oracle."""
 
 import ctypes
+from functools import partial
 
 import pytest
 import torch
-from gpu.emulated import Watched
+from gpu.emulated import Watched, double_by_default
 from native.test_slice import (
     test_coefficients_that_are_not_in_use_have_no_gradient,
     test_each_output_has_its_own_gradients,
@@ -33,6 +34,17 @@ def test_any_number_of_them(engine, device, count):
     agree(engine, splats("joint", count), moment())
     kernels = [name for name, _ in device.launched[before:]]
     assert kernels == (["fp_slice", "fp_unslice"] if count else [])
+
+
+@pytest.mark.parametrize(
+    "state",
+    [torch.no_grad, torch.inference_mode, double_by_default, partial(torch.device, "meta")],
+    ids=["no gradients", "inference", "double by default", "another device by default"],
+)
+def test_a_gpu_is_tried_whatever_the_host_has_set(device, state):
+    expect_right.cache_clear()
+    with state():
+        expect_right(device, torch.device("cpu"))
 
 
 def test_a_gpu_that_cuts_wrongly_is_refused(device):
