@@ -47,7 +47,7 @@ def empty(workspace: binding.Workspace, *shape: int, dtype: torch.dtype = torch.
     """
     size = 4 * math.prod(shape)
     if size < SMALL:
-        return torch.empty(shape, dtype=dtype)
+        return torch.empty(shape, dtype=dtype, device="cpu")
     return torch.frombuffer(workspace.take(size), dtype=dtype).view(shape)
 
 

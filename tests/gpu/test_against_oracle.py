@@ -22,7 +22,11 @@ from native.test_against_oracle import (
     test_tall_stacks_stop_where_the_oracle_does,
 )
 from native.test_dialects import test_offsets_beyond_all_bounds_are_refused
-from native.test_invariants import assert_identical, everything
+from native.test_invariants import (
+    assert_identical,
+    everything,
+    test_where_torch_puts_new_tensors_by_default_is_nothing_to_it,
+)
 
 from fragprune_plugins.engines.cpu.engine import CpuEngine
 from fragprune_plugins.engines.cuda import engine as cuda
@@ -36,6 +40,7 @@ __all__ = [
     "test_nothing_to_draw_leaves_the_background",
     "test_offsets_beyond_all_bounds_are_refused",
     "test_tall_stacks_stop_where_the_oracle_does",
+    "test_where_torch_puts_new_tensors_by_default_is_nothing_to_it",
 ]
 
 KINDS = [

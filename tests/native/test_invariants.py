@@ -118,6 +118,15 @@ def test_gradients_come_in_the_dtype_and_only_where_they_are_wanted(engine):
     assert inputs.splats.means.grad is None
 
 
+def test_where_torch_puts_new_tensors_by_default_is_nothing_to_it(engine):
+    inputs, thresholds = scenes.random_scene(0), scenes.random_thresholds(0, 60)
+    expected = engine.rasterize(inputs, thresholds)
+    with torch.device("meta"):
+        found = engine.rasterize(inputs, thresholds)
+    assert torch.equal(found.image, expected.image)
+    assert torch.equal(found.fragments_per_pixel, expected.fragments_per_pixel)
+
+
 def test_subsets_of_gradients_equal_the_whole(engine):
     inputs = scenes.random_scene(4, 120, 50, 40, sh_degree=2, compensation="antialiasing")
     thresholds = scenes.random_thresholds(4, 120)

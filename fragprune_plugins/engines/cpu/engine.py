@@ -75,8 +75,8 @@ class _Drawing:
             self.arrays = {}
         self.evaluated, self.entries = outputs.evaluated, outputs.entries
         self.stages = {name: getattr(outputs, f"{name}_ms") for name in _STAGES}
-        per_pixel = outputs.drawn / (view.width * view.height)
-        return drawn | {"fragments_per_pixel": torch.tensor(per_pixel, dtype=torch.float32)}
+        per_pixel = fresh().fill_(outputs.drawn / (view.width * view.height))
+        return drawn | {"fragments_per_pixel": per_pixel}
 
     def undraw(self, wanted: Wanted, by: dict[str, Tensor]) -> dict[str, Tensor]:
         """Run the backward pass; returns gradients by name, float32 on the CPU."""
