@@ -38,6 +38,7 @@ def checks(kept: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(self_check, "_run", lambda device: found.pop(0))
     monkeypatch.setattr(self_check, "_circumstances", lambda device: "here")
     monkeypatch.setattr(driver, "missing", lambda: None)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
     yield found
     a_new_process()
 
@@ -68,6 +69,14 @@ def test_what_doctor_finds_meanwhile_counts_at_once(checks):
     for found in (FAILS, AGREES):
         assert check_in_subprocess("cuda") == found
         assert why_not("cuda") == (None if found is AGREES else found)
+
+
+def test_the_gpu_in_use_is_checked_not_the_first(checks, monkeypatch):
+    """The check's process has a current device of its own."""
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 1)
+    monkeypatch.setattr(self_check, "_run", lambda device: Verdict("fails", device))
+    for device in ("cuda", "cuda:1", torch.device("cuda")):
+        assert why_not(device) == Verdict("fails", "cuda:1")
 
 
 def test_a_damaged_memory_is_none(checks, kept):

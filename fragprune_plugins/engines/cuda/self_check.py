@@ -67,7 +67,10 @@ class Verdict:
 
 def why_not(device: torch.device | str) -> Verdict | None:
     """The reason not to draw with the cuda engine on a GPU; None if it passed the check there."""
-    verdict = _remembered(device) or _checked(str(device))
+    where = torch.device(device)
+    if where.index is None:  # the check's process has a current device of its own
+        where = torch.device(where.type, torch.cuda.current_device())
+    verdict = _remembered(where) or _checked(str(where))
     return None if verdict.outcome == "agrees" else verdict
 
 
