@@ -59,8 +59,17 @@ BOTH_KINDS_OF_CODE = """
 self_check.why_not = lambda device: None
 assert create_engine("auto", "cuda").name == "cuda"
 assert_identical(expected, everything(CudaEngine(deterministic=True), inputs, thresholds))
+assert CudaEngine().device is CudaEngine().device
 os.environ["FAKE_REFUSES"] = "machine code"
-assert_identical(expected, everything(CudaEngine(deterministic=True), inputs, thresholds))
+anew = CudaEngine(Driver(), deterministic=True)
+assert_identical(expected, everything(anew, inputs, thresholds))
+os.environ["FRAGPRUNE_CUDA"] = "off"
+try:
+    CudaEngine()
+except EngineError as error:
+    assert "switched off" in error.found, error
+else:
+    raise AssertionError
 """
 
 ANOTHER_GPU = """

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 
 import torch
 from torch import Tensor
 
 from fragprune_plugins.engines.calling import Wanted, with_gradients, with_joined_sh
-from fragprune_plugins.engines.cuda.driver import Driver
+from fragprune_plugins.engines.cuda.driver import Driver, missing
 from fragprune_plugins.engines.cuda.frame import ENTRIES_MAX, Device, Drawing
 from fragprune_plugins.errors import EngineError, InputError
 from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats
+
+
+@cache
+def _driver(why_not: str | None) -> Driver:
+    """The driver of this process, where it can run: what it has loaded, it does not unload."""
+    return Driver()
 
 
 class CudaEngine:
@@ -34,7 +40,7 @@ class CudaEngine:
     capacity = 1 << 20
 
     def __init__(self, device: Device | None = None, *, deterministic: bool | None = None) -> None:
-        self.device = Driver() if device is None else device
+        self.device = _driver(missing()) if device is None else device
         self._deterministic = deterministic
 
     def rasterize(self, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
