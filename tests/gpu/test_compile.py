@@ -1,5 +1,6 @@
 """Every kernel compiles for every architecture, and none of its numbers leaves the registers."""
 
+import re
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -84,7 +85,10 @@ def test_a_gpu_that_the_toolkit_does_not_know_gets_ptx(nvrtc):
     assert kernels.target_of(99, (75, 90, 100)) == "compute_90"
     with pytest.raises(kernels.Unavailable, match="older"):
         kernels.target_of(70, (75, 90))
-    assert b".target sm_75" in nvrtc.compile("blend", MACROS, "compute_75").code
+    code = nvrtc.compile("scene", MACROS, "compute_75").code
+    assert b".target sm_75" in code
+    # A driver may fuse what says nothing of rounding, and two kernels would disagree by a bit.
+    assert not re.search(rb"\b(mul|add|sub)\.(f32|f64)", code)
 
 
 def test_what_is_built_beforehand_is_what_training_asks_for():
