@@ -9,15 +9,13 @@ from __future__ import annotations
 import ctypes
 import threading
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import torch
 
 from fragprune_plugins.engines.cuda import kernels
+from fragprune_plugins.engines.cuda.frame import THREADS
 from fragprune_plugins.errors import EngineError, KernelError
-
-THREADS: Final = 256
-"""Of every block of every kernel (native/cuda/frame.h)."""
 
 
 def missing() -> str | None:
@@ -124,10 +122,9 @@ class Driver:
         """Load machine code for this GPU, or PTX if its driver refuses the machine code."""
         self._call("cuCtxSynchronize")  # or a kernel that failed earlier would seem to be a refusal
         major, minor = torch.cuda.get_device_capability(index)
-        capability = 10 * major + minor
         compiler = kernels.compiler()
         try:
-            target = kernels.target_of(capability, compiler.architectures)
+            target = kernels.target_of(10 * major + minor, compiler.architectures)
             failures = []
             for way in dict.fromkeys((target, target.replace("sm_", "compute_"))):
                 image, _ = kernels.image_of(source, macros, way, compiler)

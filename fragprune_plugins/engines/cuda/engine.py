@@ -54,9 +54,7 @@ class CudaEngine:
         inputs.check_thresholds(thresholds)
         if isinstance(inputs.splats, Splats) and inputs.splats.flat:
             expected = "3D Gaussians: there are no kernels for surfels"
-            remedy = (
-                "Run on the CPU (--device cpu), or draw small pictures with --engine reference."
-            )
+            remedy = "Run on the CPU (--device cpu), or draw it small with --engine reference."
             raise EngineError("engine 'cuda'", "surfels (2 scales each)", expected, remedy)
         if inputs.rim != "hard" and thresholds is not None:
             expected = "a hard rim: there are no kernels for another"

@@ -184,10 +184,9 @@ class Arena:
     def __getitem__(self, name: str) -> int:
         return self.memory.data_ptr() + self._at[name]
 
-    def tensor(self, name: str, count: int, dtype: torch.dtype) -> Tensor:
-        """An array as a tensor."""
-        size = torch.empty((), dtype=dtype).element_size()
-        return self.memory[self._at[name] :][: count * size].view(dtype)
+    def numbers(self, name: str, count: int) -> Tensor:
+        """An array's first int64 numbers as a tensor."""
+        return self.memory[self._at[name] :][: 8 * count].view(torch.int64)
 
 
 def blocks_of(count: int, per_block: int = THREADS) -> int:
@@ -255,7 +254,8 @@ class Drawing:
         offsets = self._arrays.get("sample_offsets")
         self._spread = None if offsets is None else offsets.abs().amax()
         self._across, self._down = -(-view.width // TILE), -(-view.height // TILE)
-        self._passes = max(1, blocks_of((self._across * self._down - 1).bit_length(), 8))
+        self._tiles, self._pixels = self._across * self._down, view.width * view.height
+        self._passes = max(1, blocks_of((self._tiles - 1).bit_length(), 8))
         self._channels = 0 if inputs.splats.features is None else inputs.splats.features.shape[1]
         self._frame: Frame | None = None
 
@@ -272,7 +272,6 @@ class Drawing:
             Tensors by their names in ``RasterOutputs``.
         """
         inputs, n, where = self._inputs, self._n, self.where
-        tiles, pixels = self._across * self._down, inputs.view.width * inputs.view.height
         keep = bool(wanted)
         cleared, scratch, kept = self._room(capacity, keep, keep and deterministic)
         planes = get_args(Plane)  # the kernels spare none
@@ -297,14 +296,13 @@ class Drawing:
         macros = blend_macros(
             self._channels, counts=inputs.counts, scores=inputs.scores, stop=inputs.stop is not None
         )
-        self._launch("blend", macros, "fp_blend", tiles, frame)
-        found = cleared.tensor("counters", 4, torch.int64)
+        self._launch("blend", macros, "fp_blend", self._tiles, frame)
+        found = self._found = cleared.numbers("counters", 4)
         if keep:
             frame.outputs = binding.Outputs()  # backward does without
             self._frame = frame
         self._memory = (cleared, kept)
-        self._found = found
-        per_pixel = (found[2].double() / pixels).float()
+        per_pixel = (found[2].double() / self._pixels).float()
         if weights is not None:
             outputs["weights_per_gaussian"] = (weights.double() * 2.0**-32).float()
         return outputs | {"fragments_per_pixel": per_pixel}
@@ -320,9 +318,7 @@ class Drawing:
             Arrays that begin with zeros; those needed until the lists are made; and those that
             backward reads.
         """
-        n, where = self._n, self.where
-        tiles = self._across * self._down
-        pixels = self._inputs.view.width * self._inputs.view.height
+        n, where, pixels = self._n, self.where, self._pixels
         cleared = Arena(
             where,
             torch.zeros,
@@ -333,7 +329,7 @@ class Drawing:
             tile_histogram=4 * PASSES * DIGITS,
             depth_sort=4 * PASSES * DIGITS * blocks_of(n, SORT_KEYS),
             tile_sort=4 * self._passes * DIGITS * blocks_of(capacity, SORT_KEYS),
-            ranges=8 * tiles,
+            ranges=8 * self._tiles,
         )
         scratch = Arena(
             where,
@@ -421,11 +417,10 @@ class Drawing:
         )
         sums = 1 + sum(macros[f"FP_{k}"] for k in ("THRESHOLD", "DEPTH", "ABSOLUTE", "FEATURES"))
         sums += 5 * macros["FP_GEOMETRY"] + 3 * macros["FP_COLOUR"]
-        tiles = self._across * self._down
         shapes = {name: array.shape for name, array in self._arrays.items()}
         shapes["hook"] = torch.Size((n, 3))
         grads = {name: self._new(shapes[name]) for name in wanted - {"background"}}
-        by_tile = self._new(tiles, 3) if "background" in wanted else None
+        by_tile = self._new(self._tiles, 3) if "background" in wanted else None
         per_gaussian = n > 0 and bool(grads)
         rows = frame.capacity if frame.owners else n
         room = self._new(rows * sums).zero_() if per_gaussian else None
@@ -440,7 +435,7 @@ class Drawing:
             sums=room,
             ceiling=math.inf if inputs.cap_gradient else inputs.alpha_max,
         )
-        self._launch("unblend", macros, "fp_unblend", tiles, arguments)
+        self._launch("unblend", macros, "fp_unblend", self._tiles, arguments)
         if per_gaussian:
             self._launch("unblend", macros, "fp_chain", blocks_of(n), arguments)
         if by_tile is not None:

@@ -146,8 +146,7 @@ def target_of(capability: int, architectures: tuple[int, ...]) -> str:
     """
     if capability in architectures:
         return f"sm_{capability}"
-    older = [code for code in architectures if code <= capability]
-    if not older:
+    if not (older := [code for code in architectures if code <= capability]):
         least = min(architectures, default=OLDEST) / 10
         raise Unavailable(f"compute capability {capability / 10} is older than {least}")
     return f"compute_{max(older)}"
@@ -158,8 +157,7 @@ def target_of(capability: int, architectures: tuple[int, ...]) -> str:
 
 def cache_folder() -> Path:
     """Where compiled kernels are kept: $FRAGPRUNE_CACHE, or the platform's cache folder."""
-    named = os.environ.get(CACHE, "")
-    if named:
+    if named := os.environ.get(CACHE):
         return Path(named)
     try:
         from platformdirs import user_cache_path
