@@ -69,8 +69,9 @@ def on_view(session: SessionState, call: SeamCall) -> Any:
         else:
             expect_to_train(session, call, model)
     if state is not None and state.stage is not None:
-        state.beside = learned and bool(state.ordered) and state.stepped == state.steps
-        if learned and not state.beside:
+        late = bool(state.ordered) and state.stepped == state.steps
+        state.beside = late or not learned
+        if not state.beside:
             state.drawn = state.steps
             if state.stage.plan is not None:
                 views = view if isinstance(view, tuple) else (view,)

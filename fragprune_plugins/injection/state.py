@@ -55,7 +55,8 @@ class ModelState:
         lent: per running optimizer step, (param group, the host's rate) to restore.
         drawn: value of ``steps`` when a view was last drawn to learn from.
         ordered: steps begin, draw, and go backward before optimizers step; None until one did.
-        beside: this view was drawn between two such steps, as for a viewer: nobody learns from it.
+        beside: nobody learns from this view: it is drawn without gradients, as held-out ones are,
+            or between two such steps, as for a viewer.
     """
 
     store: ThresholdStore

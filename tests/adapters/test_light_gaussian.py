@@ -237,6 +237,18 @@ def test_a_teacher_is_drawn_with_its_own_thresholds_and_never_trained(mini):
         assert list(state.stage._before) == [(camera.uid, 0)]  # copies of a camera are one view
 
 
+def test_a_held_out_view_with_the_number_of_a_training_view_is_no_visit_of_it(mini):
+    with joint(**of(mini)) as host:
+        model, camera, held_out = host.model(COUNT), host.camera(), host.camera(side=0.6)
+        held_out.uid = camera.uid
+        host.step(model, camera, 1)
+        before = host.finish()
+        with torch.no_grad():
+            host.render(held_out, model)
+        assert host.finish() == before
+        assert before.fragments_after > 0
+
+
 def test_flags_of_distillation_are_left_out_of_what_resumes_it():
     shared = ["-s", "a", "-m", "b", "--eval", "--test_iterations", "-1"]
     own = ["--new_max_sh", "1", "--teacher_model", "t", "--enable_opacity", "--opacity_prune", "0"]
