@@ -6,7 +6,7 @@ import ast
 import contextlib
 import logging
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -460,6 +460,11 @@ class GraphdecoAdapter(ScriptAdapter):
         """(N,) after the sigmoid."""
         opacities: Tensor = model.get_opacity
         return opacities.detach().reshape(-1)
+
+    def view(self, camera: Any) -> Hashable:
+        """Number, name and width, because some hosts make or copy cameras for every step."""
+        known = [getattr(camera, each, None) for each in ("uid", "image_name", "image_width")]
+        return super().view(camera) if None in known else " ".join(map(str, known))
 
     def read_model(self, ply: Path) -> Model:
         """The host's own PLY."""

@@ -86,7 +86,3 @@ class LightGaussian(GraphdecoAdapter):
     def densified(self, repo: HostRepo, script: Path, arguments: list[str]) -> int | None:
         """The last pruning of a training; None for scripts that go on from a checkpoint."""
         return super().densified(repo, script, arguments) if script.name == TRAIN else None
-
-    def view(self, camera: Any) -> int:
-        """The camera's number, because distillation draws through copies of its cameras."""
-        return int(getattr(camera, "uid", id(camera)))

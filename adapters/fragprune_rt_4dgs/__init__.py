@@ -134,10 +134,6 @@ class RT4DGS(GraphdecoAdapter):
             )
         return script, arguments
 
-    def view(self, camera: Any) -> int:
-        """The camera's number, because every render gets a copy of its camera."""
-        return int(camera.uid)
-
     # -- its models ------------------------------------------------------------------------------
 
     def extra_parameters(self, model: Any) -> list[Tensor]:

@@ -322,7 +322,10 @@ class HostAdapter(ABC):
         """(N,) activated opacities."""
 
     def view(self, camera: Any) -> Hashable:
-        """A key that identifies a training view, or a tuple of several; by default the id."""
+        """A key that identifies a training view, or a tuple of several.
+
+        By default the id, which only serves a host that keeps its cameras: others get one again.
+        """
         return id(camera)
 
     def model_of(self, call: SeamCall) -> Any:

@@ -234,7 +234,7 @@ def test_a_teacher_is_drawn_with_its_own_thresholds_and_never_trained(mini):
             assert not torch.equal(host.render(camera, teacher)["render"], pictures[0])
         state = host.last_state
         assert state.store is host.store(student)
-        assert list(state.stage._before) == [(camera.uid, 0)]  # copies of a camera are one view
+        assert len(state.stage._before) == 1  # copies of a camera are one view
 
 
 def test_a_held_out_view_with_the_number_of_a_training_view_is_no_visit_of_it(mini):

@@ -1,5 +1,7 @@
 """The fragment pressure that rides on the host's loss is the one written on paper."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from miniatures.vanilla_3dgs import joint, running
@@ -76,3 +78,14 @@ def test_a_host_that_steps_several_times_between_two_beginnings_learns_from_all_
             (image - other.original_image).abs().mean().backward()
             model.optimizer.step()
             assert state.stage._views.drawn == (1 if iteration == 1 else 2)
+
+
+def test_cameras_made_anew_for_each_step_are_one_view_by_number_name_and_size():
+    with running(Settings(iterations=9, goal=Pressure(1e-3), train="opacity")) as host:
+        model = host.model(40)
+        for iteration in range(1, 10):
+            host.step(model, host.camera(side=0.3 * (iteration % 2)), iteration)
+        assert len(host.session.models[model].stage._before) == 2
+        small, alike = host.camera(12, 9), SimpleNamespace(uid=0, image_width=24)
+        views = [host.adapter.view(each) for each in (host.camera(), small, alike)]
+        assert len(set(views)) == 3

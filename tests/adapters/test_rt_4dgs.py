@@ -334,6 +334,6 @@ def test_copies_of_a_camera_are_one_view(mini):
         for iteration in (2, 3, 4):
             host.step(model, camera, iteration)
         (state,) = host.models.values()
-        assert list(state.stage._after) == [(camera.uid, 0)]
+        assert len(state.stage._after) == 1
         assert len(host.curves) == 2
         import_module("scene")
