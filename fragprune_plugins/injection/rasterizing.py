@@ -35,17 +35,20 @@ SCALER = Seam(Role.LOSS, f"{_AMP}.grad_scaler", "GradScaler.scale", ("outputs",)
 
 
 class _AddToLoss(torch.autograd.Function):
-    """Returns the image; the backward pass treats ``term`` as a summand of the loss."""
+    """Returns the image; the backward pass treats ``term`` as a summand of the loss.
+
+    A host may go backward several times, from a loss each: the term counts until it was ``felt``.
+    """
 
     @staticmethod
-    def forward(ctx: Any, image: Tensor, term: Tensor) -> Tensor:
-        ctx.term_shape = term.shape
+    def forward(ctx: Any, image: Tensor, term: Tensor, felt: list[bool]) -> Tensor:
+        ctx.shape, ctx.felt = term.shape, felt
         return image.view_as(image)
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor]:
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor, None]:
         (grad,) = grads
-        return grad, torch.ones(ctx.term_shape, dtype=grad.dtype, device=grad.device)
+        return grad, grad.new_full(ctx.shape, 0.0 if ctx.felt else 1.0), None
 
 
 def on_view(session: SessionState, call: SeamCall) -> Any:
@@ -246,6 +249,8 @@ def rasterize(
     if further_picture(state, picture) or state.stage is None or state.beside:
         return engine.rasterize(inputs, covering(thresholds, inputs))
     shown = state.stage.dropped(inputs)
+    if thresholds is not None:
+        thresholds = thresholds.view_as(thresholds)  # of this picture alone, for its hook
     outputs = engine.rasterize(shown, thresholds)
 
     def untruncated() -> RasterOutputs:
@@ -257,11 +262,17 @@ def rasterize(
     pressure = state.stage.on_drawn(picture[0], outputs, untruncated, picture[1], area)
     if pressure is None or not outputs.image.requires_grad:
         return outputs
-    return replace(outputs, image=_AddToLoss.apply(outputs.image, pressure))  # type: ignore[no-untyped-call]
+    felt: list[bool] = []
+    moved = pressure if thresholds is None else thresholds  # a host may look at other gradients
+    if moved.requires_grad:
+        moved.register_hook(lambda _: felt.append(True))  # type: ignore[no-untyped-call]
+    return replace(outputs, image=_AddToLoss.apply(outputs.image, pressure, felt))  # type: ignore[no-untyped-call]
 
 
 def on_loss(session: SessionState, call: SeamCall) -> Any:
     """Keep the host's own loss, a scalar, for the curves."""
+    if torch.overrides.has_torch_function_unary(call.instance):
+        return call.run()  # by a mode, such as that of --device cpu, which calls it once more
     state = session.last_state
     if state is not None and call.instance.numel() == 1:
         if state.stage is not None and (state.begun or len(session.models) == 1):

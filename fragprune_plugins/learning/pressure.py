@@ -120,9 +120,9 @@ class StepViews:
         self._rows.append([fragments, untruncated, pressed])  # the loss comes later
 
     def lose(self, loss: Figure) -> None:
-        """Note the loss of the view drawn last."""
+        """Note a loss of the view drawn last; several add up."""
         if self._rows:
-            self._rows[-1][3:] = [loss]
+            self._rows[-1][3:] = [sum(self._rows[-1][3:], loss)]
 
     def rows(self) -> list[list[float]]:
         """Of each view so far: fragments, untruncated, pressed, loss; NaN for an unknown one."""

@@ -89,3 +89,29 @@ def test_cameras_made_anew_for_each_step_are_one_view_by_number_name_and_size():
         small, alike = host.camera(12, 9), SimpleNamespace(uid=0, image_width=24)
         views = [host.adapter.view(each) for each in (host.camera(), small, alike)]
         assert len(set(views)) == 3
+
+
+@pytest.mark.parametrize("goal", [Pressure(0.02), Portable(0.02)])
+def test_two_losses_of_one_picture_are_pressed_upon_once_and_count_together(goal):
+    """A gradient that a host only looks at in between takes no pressure away."""
+    portable, felt = isinstance(goal, Portable), []
+    settings = Settings(iterations=9, goal=goal, train="all" if portable else "opacity")
+    for looks, apart in ((False, False), (False, True), (True, False)):
+        with joint(settings) as host:
+            model, camera = host.model(40), host.camera()
+            host.step(model, camera, 1)
+            model.update_learning_rate(2)
+            package = host.render(camera, model)
+            first, second = package["render"].mean(), package["render"].square().mean()
+            if looks:
+                torch.autograd.grad(first, package["viewspace_points"], retain_graph=True)
+            if apart:
+                first.backward(retain_graph=True)
+                second.backward()
+            else:
+                (first + second).backward()
+            stage = host.session.models[model].stage
+            grads = [*host.gradients(model).values(), stage.store.logits.grad]
+            felt.append([*(g for g in grads if g is not None), torch.tensor(stage._views.loss)])
+    for others in felt[1:]:
+        torch.testing.assert_close(others, felt[0], rtol=1e-4, atol=1e-8)
