@@ -195,7 +195,7 @@ class Stage2:
             return None
         values = self._truncate(inputs, self.store)
         self._differentiable = values is not None and values.requires_grad
-        if values is None or self.plan is None or self.learning:
+        if values is None or self.learning:
             return values
         return values.detach()
 

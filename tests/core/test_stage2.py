@@ -359,3 +359,9 @@ def test_what_other_processes_drew_counts_like_ones_own_and_in_the_same_order(ow
     assert plain == other
     for name in ("before", "after"):
         assert torch.equal(tensors[name], others[name])
+
+
+def test_what_is_drawn_before_the_first_step_leaves_no_gradient_for_it():
+    it = stage()
+    it.store.open(OPACITIES)
+    assert not it.thresholds(None).requires_grad
