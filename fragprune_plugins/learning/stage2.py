@@ -306,9 +306,10 @@ class Stage2:
             DivergedError: NaN or infinity in the thresholds; every tenth step, and after the last,
                 in what the driver trains, too.
         """
+        if self.plan is None:  # a step before stage 2 is the driver's own
+            return
         self.taken = self.steps
         if self.learning and self.settings.goal.learns:
-            assert self.plan is not None
             self.store.step(self.plan.threshold_lr)
         looked_at = [self.store.logits]
         if self.steps % LOOKED_AT_EVERY == 0 or self.steps == self.settings.iterations:

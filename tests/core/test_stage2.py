@@ -365,3 +365,9 @@ def test_what_is_drawn_before_the_first_step_leaves_no_gradient_for_it():
     it = stage()
     it.store.open(OPACITIES)
     assert not it.thresholds(None).requires_grad
+
+
+def test_a_step_of_the_hosts_own_training_is_no_step_of_it_and_is_not_looked_at():
+    it = stage(parameters=lambda: {"xyz": torch.tensor([math.nan])})
+    it.end()
+    assert it.progress().steps == 0
