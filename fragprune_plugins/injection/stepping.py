@@ -12,6 +12,7 @@ from typing import Any
 
 from torch import Tensor
 
+from fragprune_plugins.errors import log
 from fragprune_plugins.hosts.seams import SeamCall
 from fragprune_plugins.injection import ranks
 from fragprune_plugins.injection.state import ModelState, SessionState
@@ -48,6 +49,9 @@ def on_attach(session: SessionState, call: SeamCall) -> Any:
     session.rates[model] = {name: group["lr"] for name, group in groups if name}
     means = session.adapter.means(model)
     if state is not None and not kept:
+        if not state.store.neutral:
+            said = "%s: other Gaussians than before; %d thresholds that were learned begin anew"
+            log.warning(said, call.seam, len(state.store))
         with session.changing(state.store, "training_setup"):
             state.store.replace(len(means))
     if not session.learn:

@@ -74,3 +74,14 @@ def test_what_a_host_worked_out_before_is_cut_off_from_what_stands_still_alone()
         assert cut(other) is other
         assert cut(moving) is moving
         assert cut("a word") == "a word"
+
+
+def test_thresholds_that_were_learned_are_not_dropped_for_new_gaussians_without_a_word(caplog):
+    with running(Settings(iterations=9, train="opacity")) as host:
+        model = host.model(20)
+        for told in (0, 1):
+            model._xyz = torch.nn.Parameter(model._xyz.detach().clone())
+            model.training_setup(host.arguments)
+            assert host.store(model).neutral
+            assert len([each for each in caplog.messages if "20 thresholds" in each]) == told
+            host.step(model, host.camera(), 1)
