@@ -89,6 +89,23 @@ def test_rows_that_changed_unseen_are_noticed_before_anything_is_saved(tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
+def test_what_a_host_writes_beside_its_model_follows_it_each_time_folders_too(tmp_path):
+    session = state()
+    model, _ = follow(session)
+    path = tmp_path / "out" / "a.ply"
+    for content in ("first", "second"):
+
+        def write(path, content=content):
+            (path.parent / "networks").mkdir()
+            for each in (path, path.with_name("a.npz"), path.parent / "networks" / "colour.pt"):
+                each.write_text(content)
+
+        saving.on_save(session, call(model, Role.SAVE, write, path, how=lambda call: call.first))
+        for each in ("a.ply", "a.npz", "networks/colour.pt"):
+            assert (path.parent / each).read_text() == content
+        assert sidecar.belongs(path)
+
+
 @pytest.mark.parametrize("warming", [True, False, None])
 def test_a_model_saved_before_thresholds_open_is_warned_of(tmp_path, caplog, warming):
     session = state()
