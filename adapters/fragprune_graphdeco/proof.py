@@ -6,7 +6,7 @@ shows every rule.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import sha256
@@ -78,11 +78,14 @@ class RasterizerProver(Prover):
 
     def prove(self, call: SeamCall, drawn: HostCall, place: Place) -> Proof:
         """Compare every output and every gradient."""
-        trial = _Trial(self.dialect, call, drawn, place)
-        try:
-            return trial.prove()
-        except _OtherwiseError as error:
-            return Proof(trial.where, (), failed=str(error))
+        with torch.inference_mode(False), torch.enable_grad():  # a host may draw in either
+            given, settings = _derivable(drawn.arguments), _derivable(drawn.settings)
+            drawn = replace(drawn, arguments=given, settings=settings)
+            trial = _Trial(self.dialect, call, drawn, place)
+            try:
+                return trial.prove()
+            except _OtherwiseError as error:
+                return Proof(trial.where, (), failed=str(error))
 
     def answer(
         self, call: HostCall, inputs: RasterInputs, draw: Callable[..., RasterOutputs], proof: Proof
@@ -122,6 +125,15 @@ def _made(name: str, seen: Seen) -> Any:
 
 def _tuple(answered: Any) -> tuple[Any, ...]:
     return tuple(answered) if isinstance(answered, tuple | list) else (answered,)
+
+
+def _derivable(value: Any) -> Any:
+    """A value, or the values of a mapping or a named tuple; copies of what inference mode made."""
+    if isinstance(value, Mapping):
+        return {name: _derivable(each) for name, each in value.items()}
+    if hasattr(value, "_replace"):
+        return value._replace(**_derivable(value._asdict()))
+    return value.clone() if isinstance(value, Tensor) and value.is_inference() else value
 
 
 def _rule(value: Any) -> str:
@@ -175,15 +187,14 @@ class _Trial:
             own[band] = own[band].detach().clone(memory_format=torch.contiguous_format)
             own[band].view(count, -1)[:, :3] += _FROM_BLACK
         here = torch.device("cpu")  # whatever the host makes torch's default
-        with torch.enable_grad():
-            with here:
-                chart = likeness.chart(own, self.dialect.unpack(self.drawn).view)
-            both = [
-                self._draw("the host's own call", own, settings, likeness.OWN),
-                self._draw("a chart through its camera", chart, self._for_the_chart(), 1),
-            ]
-            with here:
-                found = [self._output(number, both) for number in range(len(both[0].theirs))]
+        with here:
+            chart = likeness.chart(own, self.dialect.unpack(self.drawn).view)
+        both = [
+            self._draw("the host's own call", own, settings, likeness.OWN),
+            self._draw("a chart through its camera", chart, self._for_the_chart(), 1),
+        ]
+        with here:
+            found = [self._output(number, both) for number in range(len(both[0].theirs))]
         made = {number: name for number, (name, new) in enumerate(found) if new}
         return Proof(self.where, tuple(name for name, _ in found), made)
 

@@ -114,6 +114,18 @@ def test_outputs_are_told_by_their_numbers(host, difference):
     assert f"render ({RENDERER}:" in proved.call
 
 
+@pytest.mark.parametrize("made_inside", [False, True])
+def test_a_host_that_draws_in_inference_mode_is_proved_as_any_other(host, made_inside):
+    with running(host("none")) as started, contextlib.ExitStack() as inference:
+        if made_inside:
+            inference.enter_context(torch.inference_mode())
+        model, camera = started.model(40, setup=False), started.camera(96, 64)
+        with torch.inference_mode():
+            started.render(camera, model)
+        (proved,) = started.session.proofs.values()
+    assert proved.outputs == EQUAL["none"]
+
+
 def black(model):
     """Where colours are cut: the harmonics give 0 but for rounding, on either side of the cut."""
     model._features_dc.copy_(torch.tensor(-0.5) / 0.28209479177387814)
