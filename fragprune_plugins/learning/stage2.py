@@ -158,6 +158,9 @@ class Stage2:
         self._open |= self.plan.learn
         if self.plan.counted:
             self.store.ruled(stop=self.settings.stop_of(self.store.stop), rim=self.settings.rim)
+        if not (self.settings.goal.learns or self.store.neutral):
+            log.warning("the model's cutoffs are dropped: a %s has none", self.settings.goal.name)
+            self.store.replace(len(self.store))
         if self.plan.learn and self.settings.goal.learns:
             if not self.store.opened:
                 known = opacities()

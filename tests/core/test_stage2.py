@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from fragprune_plugins import Control, Fewer, Pressure, ThresholdStore
+from fragprune_plugins import Control, Fewer, Portable, Pressure, ThresholdStore
 from fragprune_plugins.errors import ResetError, UsageError
 from fragprune_plugins.learning.schedule import JointSchedule, Schedule, Settings, StepPlan
 from fragprune_plugins.learning.stage2 import Stage2, evenly_spaced, stored_thresholds
@@ -158,6 +158,17 @@ def test_a_control_draws_without_thresholds_and_still_counts():
     it.close()
     assert it.store.steps == 0
     assert [stats.fragments_per_pixel for stats in told] == [20.0]
+
+
+@pytest.mark.parametrize("goal", [Control(), Portable()])
+def test_what_learns_no_thresholds_keeps_none_that_its_pictures_do_not_have(goal, caplog):
+    it = stage(settings=Settings(iterations=10, goal=goal))
+    it.store.open(OPACITIES)
+    for _ in range(2):
+        it.begin(lambda: OPACITIES)
+        assert it.thresholds(None) is None
+        assert it.store.neutral
+    assert len(caplog.messages) == 1
 
 
 def test_a_loss_without_a_view_is_nobodys():
