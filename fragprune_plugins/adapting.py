@@ -2,7 +2,7 @@
 
 a host      HostAdapter, or ScriptAdapter where it has training scripts; HostInfo, HostRepo,
             ParamGroup and those of 3DGS (GROUPS), Finding
-its source  nodes, imported, is_off, off_by_default of what HostRepo reads; Plain, change_of
+its source  nodes, imported of what HostRepo reads; Plain, change_of
 its seams   Seam, Role, SeamCall, RowTrace, revised
 drawing     Dialect, HostCall; RasterInputs and its parts, RasterOutputs
 a proof     Prover, Proof, Place
@@ -66,9 +66,7 @@ from fragprune_plugins.hosts.seams import revised as revised
 from fragprune_plugins.hosts.source import Function as Function
 from fragprune_plugins.hosts.source import HostRepo as HostRepo
 from fragprune_plugins.hosts.source import imported as imported
-from fragprune_plugins.hosts.source import is_off as is_off
 from fragprune_plugins.hosts.source import nodes as nodes
-from fragprune_plugins.hosts.source import off_by_default as off_by_default
 from fragprune_plugins.learning.goals import parse_goal as parse_goal
 from fragprune_plugins.plugins.hookspecs import hookimpl as hookimpl
 from fragprune_plugins.types import Footprints as Footprints

@@ -16,12 +16,14 @@ from fragprune_graphdeco import (
     arguments,
     assigned,
     every,
+    is_off,
     kernels,
+    off_by_default,
     reading,
     syntax,
     text_of,
 )
-from fragprune_plugins.adapting import is_off, nodes, off_by_default
+from fragprune_plugins.adapting import nodes
 
 _MODEL_ARGUMENTS = ("pc", "gaussians", "gaussian", "model")
 NEUTRAL = {"antialiasing", "confidence", "projmatrix_raw"}

@@ -18,8 +18,8 @@ from fragprune_3dgs_fork.fork import (
     methods_of,
     while_densifying,
 )
-from fragprune_graphdeco import assigned, every, reading, text_of
-from fragprune_plugins.adapting import Finding, HostRepo, is_off
+from fragprune_graphdeco import assigned, every, is_off, reading, text_of
+from fragprune_plugins.adapting import Finding, HostRepo
 
 PARAMETERS = {"_xyz", "_features_dc", "_features_rest", "_opacity", "_scaling", "_rotation"}
 PRIMITIVES = {"_prune_optimizer", "cat_tensors_to_optimizer", "replace_tensor_to_optimizer"}

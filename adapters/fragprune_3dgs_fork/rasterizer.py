@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import fragprune_graphdeco as graphdeco
-from fragprune_graphdeco import assigned, every, kernels, text_of
-from fragprune_plugins.adapting import HostRepo, is_off
+from fragprune_graphdeco import assigned, every, is_off, kernels, text_of
+from fragprune_plugins.adapting import HostRepo
 
 Sum = Literal["count", "weight"]
 Role = (

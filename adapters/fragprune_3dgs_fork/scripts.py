@@ -21,8 +21,8 @@ from fragprune_3dgs_fork.fork import (
     methods_of,
     under,
 )
-from fragprune_graphdeco import every, failing, reading, syntax, text_of
-from fragprune_plugins.adapting import HostRepo, is_off, nodes
+from fragprune_graphdeco import every, failing, is_off, reading, syntax, text_of
+from fragprune_plugins.adapting import HostRepo, nodes
 
 _CHECKPOINT = re.compile(
     rf"(^|[/'\"]){CHECKPOINT}(['\"] \+ str\(\w+\) \+ ['\"]|{{\w*(:\w+)?}}|%d)\.pth"

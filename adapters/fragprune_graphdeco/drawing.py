@@ -18,11 +18,13 @@ from fragprune_graphdeco.syntax import (
     entries,
     every,
     first_of,
+    is_off,
+    off_by_default,
     passed,
     skipped,
     text_of,
 )
-from fragprune_plugins.adapting import Function, HostRepo, change_of, is_off, nodes, off_by_default
+from fragprune_plugins.adapting import Function, HostRepo, change_of, nodes
 
 _OF_MODEL = re.compile(
     r"get_(xyz|opacity|scaling|rotation|features\w*|covariance)|_(xyz|opacity|scaling|rotation|"

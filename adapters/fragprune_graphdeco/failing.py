@@ -19,8 +19,18 @@ from fragprune_graphdeco.reading import (
     options_of,
     own_imports,
 )
-from fragprune_graphdeco.syntax import assigned, chosen, entries, every, passed, skipped, text_of
-from fragprune_plugins.adapting import HostRepo, imported, is_off, nodes, off_by_default
+from fragprune_graphdeco.syntax import (
+    assigned,
+    chosen,
+    entries,
+    every,
+    is_off,
+    off_by_default,
+    passed,
+    skipped,
+    text_of,
+)
+from fragprune_plugins.adapting import HostRepo, imported, nodes
 
 _ELSEWHERE = re.compile(r"\w+(?:\.\w+)*\.(?:scene(?:\.\w+)*|gaussian_renderer)")
 

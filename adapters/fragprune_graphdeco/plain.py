@@ -18,8 +18,8 @@ from fragprune_graphdeco.drawing import Drawing, arguments, drawing_in
 from fragprune_graphdeco.kernels import NEAR, ORDER, SPLAT, read_kernels
 from fragprune_graphdeco.photographs import unlike
 from fragprune_graphdeco.reading import ModelClass
-from fragprune_graphdeco.syntax import assigned, every, passed, text_of
-from fragprune_plugins.adapting import HostRepo, Plain, change_of, is_off, nodes, off_by_default
+from fragprune_graphdeco.syntax import assigned, every, is_off, off_by_default, passed, text_of
+from fragprune_plugins.adapting import HostRepo, Plain, change_of, nodes
 
 _DEEPEST = 3  # folders below a checkout in which codebases are looked for
 _SAVES = re.compile(r"\.save_ply\w*\(|scene\w*\.save\(")

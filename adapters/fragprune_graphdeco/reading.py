@@ -10,7 +10,16 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from fragprune_graphdeco.syntax import Known, assigned, constant, decided, every, skipped, text_of
+from fragprune_graphdeco.syntax import (
+    Known,
+    assigned,
+    constant,
+    decided,
+    every,
+    is_off,
+    skipped,
+    text_of,
+)
 from fragprune_plugins.adapting import (
     CommandLine,
     Finding,
@@ -18,7 +27,6 @@ from fragprune_plugins.adapting import (
     HostRepo,
     UsageError,
     imported,
-    is_off,
     nodes,
 )
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from functools import lru_cache
 from typing import Any, TypeVar
 
-from fragprune_plugins.adapting import nodes
+from fragprune_plugins.adapting import Function, nodes
 
 Node = TypeVar("Node", bound=ast.AST)
 
@@ -28,6 +28,19 @@ def every(tree: ast.AST | None, *kinds: type[Node]) -> tuple[Node, ...]:
 @lru_cache(maxsize=4096)
 def _every(tree: ast.AST | None, kinds: tuple[type[Node], ...]) -> tuple[Node, ...]:
     return tuple(each for each in nodes(tree) if isinstance(each, kinds))
+
+
+def off_by_default(function: Function) -> set[str]:
+    """Parameters that are None or False by default."""
+    a = function.args
+    named = [*a.posonlyargs, *a.args][-len(a.defaults) :] if a.defaults else []
+    pairs = zip([*named, *a.kwonlyargs], [*a.defaults, *a.kw_defaults], strict=True)
+    return {each.arg for each, value in pairs if is_off(value)}
+
+
+def is_off(value: ast.expr | None) -> bool:
+    """Whether an expression is None or False."""
+    return isinstance(value, ast.Constant) and value.value in (None, False)
 
 
 def assigned(tree: ast.AST | None) -> list[tuple[ast.expr, ast.expr]]:

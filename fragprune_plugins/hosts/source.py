@@ -7,6 +7,7 @@ import os
 import re
 import warnings
 from collections.abc import Iterable
+from contextlib import suppress
 from functools import cache, cached_property, lru_cache
 from importlib.metadata import distributions
 from importlib.util import find_spec
@@ -65,19 +66,6 @@ def imported(tree: ast.Module | None) -> list[str]:
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
             names[node.module.split(".")[0]] = None
     return list(names)
-
-
-def off_by_default(function: Function) -> set[str]:
-    """Parameters that are None or False by default."""
-    a = function.args
-    named = [*a.posonlyargs, *a.args][-len(a.defaults) :] if a.defaults else []
-    pairs = zip([*named, *a.kwonlyargs], [*a.defaults, *a.kw_defaults], strict=True)
-    return {each.arg for each, value in pairs if is_off(value)}
-
-
-def is_off(value: ast.expr | None) -> bool:
-    """Whether an expression is None or False."""
-    return isinstance(value, ast.Constant) and value.value in (None, False)
 
 
 @lru_cache(maxsize=256)
@@ -144,12 +132,10 @@ class HostRepo:
 
     def read(self, path: Path) -> str:
         """The text of a file, without a mark of its encoding; "" where it is missing or outside."""
-        try:
+        with suppress(UnknownHostError):
             if self._inside(path):
                 with _FILE.reading(path) as reading:
                     return reading.file.read().decode("utf-8", "replace").removeprefix("\ufeff")
-        except UnknownHostError:
-            pass
         return ""
 
     def tree(self, module: str) -> ast.Module | None:
