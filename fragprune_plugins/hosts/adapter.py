@@ -322,10 +322,7 @@ class HostAdapter(ABC):
         """(N,) activated opacities."""
 
     def view(self, camera: Any) -> Hashable:
-        """A key that identifies a training view, or a tuple of several.
-
-        By default the id, which only serves a host that keeps its cameras: others get one again.
-        """
+        """A key of a training view, or a tuple of several; the id of a camera that is kept."""
         return id(camera)
 
     def model_of(self, call: SeamCall) -> Any:

@@ -35,20 +35,17 @@ SCALER = Seam(Role.LOSS, f"{_AMP}.grad_scaler", "GradScaler.scale", ("outputs",)
 
 
 class _AddToLoss(torch.autograd.Function):
-    """Returns the image; the backward pass treats ``term`` as a summand of the loss.
-
-    A host may go backward several times, from a loss each: the term counts until it was ``felt``.
-    """
+    """Returns the image; the backward pass treats ``term`` as a summand of the loss."""
 
     @staticmethod
-    def forward(ctx: Any, image: Tensor, term: Tensor, felt: list[bool]) -> Tensor:
-        ctx.shape, ctx.felt = term.shape, felt
+    def forward(ctx: Any, image: Tensor, term: Tensor) -> Tensor:
+        ctx.term_shape = term.shape
         return image.view_as(image)
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor, None]:
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor]:
         (grad,) = grads
-        return grad, grad.new_full(ctx.shape, 0.0 if ctx.felt else 1.0), None
+        return grad, grad.new_ones(ctx.term_shape)
 
 
 def on_view(session: SessionState, call: SeamCall) -> Any:
@@ -72,8 +69,7 @@ def on_view(session: SessionState, call: SeamCall) -> Any:
         else:
             expect_to_train(session, call, model)
     if state is not None and state.stage is not None:
-        late = bool(state.ordered) and state.stepped == state.steps
-        state.beside = late or not learned
+        state.beside = not learned or (state.ordered is True and state.stepped == state.steps)
         if not state.beside:
             state.drawn = state.steps
             if state.stage.plan is not None:
@@ -186,9 +182,8 @@ def further_picture(state: ModelState, picture: tuple[Hashable, int]) -> bool:
     """
     if not torch.is_grad_enabled():
         return False
-    drawn = {each for each in state.pictured if each[0] == state.steps}
-    state.pictured = drawn | {(state.steps, *picture)}
-    return len(state.pictured) == len(drawn)
+    drawn, state.pictured[picture] = state.pictured.get(picture), state.steps
+    return drawn == state.steps
 
 
 def proved_answer(
@@ -262,11 +257,16 @@ def rasterize(
     pressure = state.stage.on_drawn(picture[0], outputs, untruncated, picture[1], area)
     if pressure is None or not outputs.image.requires_grad:
         return outputs
+    counted_once(pressure, pressure if thresholds is None else thresholds)
+    return replace(outputs, image=_AddToLoss.apply(outputs.image, pressure))  # type: ignore[no-untyped-call]
+
+
+def counted_once(term: Any, moved: Any) -> None:
+    """Let a term count until its gradient came to what it moves: a host may have several losses."""
     felt: list[bool] = []
-    moved = pressure if thresholds is None else thresholds  # a host may look at other gradients
-    if moved.requires_grad:
-        moved.register_hook(lambda _: felt.append(True))  # type: ignore[no-untyped-call]
-    return replace(outputs, image=_AddToLoss.apply(outputs.image, pressure, felt))  # type: ignore[no-untyped-call]
+    if term.requires_grad and moved.requires_grad:
+        term.register_hook(lambda grad: torch.zeros_like(grad) if felt else None)
+        moved.register_hook(lambda _: felt.append(True))
 
 
 def on_loss(session: SessionState, call: SeamCall) -> Any:

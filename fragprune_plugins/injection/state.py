@@ -51,7 +51,7 @@ class ModelState:
         seen: views that were drawn to learn from, in the order of their first visits.
         loaded: the means with which a sidecar's thresholds were loaded.
         stepped: value of ``steps`` at the last step of the store.
-        pictured: what was drawn to learn from in this step: (``steps``, view, part).
+        pictured: value of ``steps`` when a (view, part) was last drawn to learn from.
         lent: per running optimizer step, (param group, the host's rate) to restore.
         drawn: value of ``steps`` when a view was last drawn to learn from.
         ordered: steps begin, draw, and go backward before optimizers step; None until one did.
@@ -72,7 +72,7 @@ class ModelState:
     hooked: weakref.WeakSet[Any] = field(default_factory=weakref.WeakSet)
     hooks: list[Any] = field(default_factory=list)
     stepped: int = -1
-    pictured: set[tuple[int, Hashable, int]] = field(default_factory=set)
+    pictured: dict[tuple[Hashable, int], int] = field(default_factory=dict)
     lent: list[list[tuple[dict[str, Any], Any]]] = field(default_factory=list)
     drawn: int = -1
     ordered: bool | None = None

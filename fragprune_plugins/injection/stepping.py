@@ -50,8 +50,7 @@ def on_attach(session: SessionState, call: SeamCall) -> Any:
     means = session.adapter.means(model)
     if state is not None and not kept:
         if not state.store.neutral:
-            said = "%s: other Gaussians than before; %d thresholds that were learned begin anew"
-            log.warning(said, call.seam, len(state.store))
+            log.warning("%s: new Gaussians, %d thresholds begin anew", call.seam, len(state.store))
         with session.changing(state.store, "training_setup"):
             state.store.replace(len(means))
     if not session.learn:
@@ -147,10 +146,9 @@ def before_step(session: SessionState, reference: Any, optimizer: Any, *_: Any) 
 def expect_sound(state: ModelState) -> None:
     """Raise DivergedError, before an optimizer steps, unless all gradients are finite."""
     if state.stage is not None and state.stage.plan is not None:
-        given = {name: each.grad for name, each in state.stage.parameters().items()}
-        found = {name: grad for name, grad in given.items() if grad is not None}
-        dense = {name: grad.to_dense() if grad.is_sparse else grad for name, grad in found.items()}
-        state.stage.expect_sound(dense)
+        trained = state.stage.parameters().items()
+        given = {name: each.grad.to_dense() for name, each in trained if each.grad is not None}
+        state.stage.expect_sound(given)
 
 
 def after_step(session: SessionState, reference: Any, *_: Any) -> None:

@@ -152,17 +152,10 @@ class PressureController(PressureRule):
         follows: per cents that it falls by if fragments fall by one.
     """
 
-    warmup = 0.2
-    """Share of the run before the first correction: thresholds have not settled."""
-
-    period = 0.04
-    """Share of the run between corrections."""
-
-    gain = 0.35
-    """Share of the error, mapped through the known curve, that one correction removes."""
-
-    reach = 60.0
-    """Lambda stays within this factor of its starting value (anti-windup)."""
+    warmup = 0.2  # share of the run before the first correction: thresholds have not settled
+    period = 0.04  # share of the run between corrections
+    gain = 0.35  # share of the error, mapped through the known curve, that a correction removes
+    reach = 60.0  # lambda stays within this factor of its starting value (anti-windup)
 
     def __init__(self, target: float, *, follows: float = 1.0) -> None:
         self.target = target

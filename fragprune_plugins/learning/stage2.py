@@ -198,9 +198,7 @@ class Stage2:
             return None
         values = self._truncate(inputs, self.store)
         self._differentiable = values is not None and values.requires_grad
-        if values is None or self.learning:
-            return values
-        return values.detach()
+        return values if values is None or self.learning else values.detach()
 
     def dropped(self, inputs: RasterInputs) -> RasterInputs:
         """A picture to learn from, without a random share of its Gaussians (``Settings.dropout``).
