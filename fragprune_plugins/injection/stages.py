@@ -365,7 +365,8 @@ class Stages:
             expected = f"iterations after {start}, where {where}"
             remedy = f"{flag}, or lower --from-iter." if start > resumed else f"{flag}."
             raise UsageError(f"--stage {self.options.stage}", found, expected, remedy)
-        settings = replace(self.options.settings, iterations=end - (resumed if joint else start))
+        steps = end - (resumed if joint else start)
+        settings = self.settings = replace(self.options.settings, iterations=steps)
         origin = Path(file) if file and start == resumed else None
         options: dict[str, Any] = {"from_step": start - resumed, "origin": origin}
         if joint:

@@ -182,6 +182,20 @@ def test_a_stage_two_that_a_host_cuts_short_is_told(scene, tmp_path, last, caplo
         assert "ended after 4 of 6 iterations" in caplog.text
 
 
+@pytest.mark.parametrize("stage", ["joint", "finetune"])
+def test_iterations_of_one_training_that_teach_nothing_are_told(scene, tmp_path, stage, caplog):
+    """A host that sets no rate any more counts no step, and nothing is pressed upon."""
+    host = shutil.copytree(HOST, tmp_path / "host")
+    text, rate = (host / "train.py").read_text(), "gaussians.update_learning_rate(iteration)"
+    assert rate in text
+    (host / "train.py").write_text(text.replace(rate, f"{rate} if iteration < 14 else None"))
+    words = command(scene, tmp_path / "out", "--iterations", 20)
+    words[1] = host / "train.py"
+    run("run", "--device", "cpu", "--stage", stage, "--from-iter", 10, *words)
+    steps = "13 of 19" if stage == "joint" else "3 of 9"
+    assert f"learned in {steps} iterations" in caplog.text
+
+
 @pytest.mark.parametrize("held", [True, False])
 def test_views_that_stage_one_saw_are_not_said_to_be_held_out(scene, tmp_path, held):
     out = tmp_path / "out"
