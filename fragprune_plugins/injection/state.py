@@ -55,8 +55,7 @@ class ModelState:
         lent: per running optimizer step, (param group, the host's rate) to restore.
         drawn: value of ``steps`` when a view was last drawn to learn from.
         ordered: steps begin, draw, and go backward before optimizers step; None until one did.
-        beside: nobody learns from this view: it is drawn without gradients, as held-out ones are,
-            or between two such steps, as for a viewer.
+        beside: this view is drawn without gradients or between two such steps: nobody learns.
     """
 
     store: ThresholdStore

@@ -152,6 +152,8 @@ class Stage2:
             ResetError: thresholds would begin to learn right after a reset of opacities.
         """
         self.close()
+        if self.plan is None:
+            self.store.logits.grad = None  # of what was drawn before, in the driver's own training
         self.steps += 1
         self.plan = self.schedule.at(self.steps)
         self._views.begin()
@@ -198,7 +200,9 @@ class Stage2:
             return None
         values = self._truncate(inputs, self.store)
         self._differentiable = values is not None and values.requires_grad
-        return values if values is None or self.learning else values.detach()
+        if values is None or self.plan is None or self.learning:
+            return values
+        return values.detach()
 
     def dropped(self, inputs: RasterInputs) -> RasterInputs:
         """A picture to learn from, without a random share of its Gaussians (``Settings.dropout``).

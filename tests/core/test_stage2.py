@@ -375,7 +375,10 @@ def test_what_other_processes_drew_counts_like_ones_own_and_in_the_same_order(ow
 def test_what_is_drawn_before_the_first_step_leaves_no_gradient_for_it():
     it = stage()
     it.store.open(OPACITIES)
-    assert not it.thresholds(None).requires_grad
+    it.thresholds(None).sum().backward()
+    assert it.store.logits.grad.any()
+    it.begin(lambda: OPACITIES)
+    assert it.store.logits.grad is None
 
 
 def test_a_step_of_the_hosts_own_training_is_no_step_of_it_and_is_not_looked_at():
