@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fragprune_plugins.errors import AlignmentError, log
+from fragprune_plugins.errors import AlignmentError, SidecarError, log
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.atomic import staging
 from fragprune_plugins.hosts.adapter import CHECKPOINT_KEY, optimizer_state
@@ -22,13 +23,20 @@ from fragprune_plugins.learning.thresholds import ThresholdStore
 def on_save(session: SessionState, call: SeamCall) -> Any:
     """Have the host write its file aside, then put file and sidecar in place, both at once.
 
-    Values that are not finite stop both.
+    Values that are not finite stop both. A model without thresholds takes away the sidecar of
+    the file that it replaces: it is of no Gaussians that are left, and readers would refuse it.
     """
     check_learned(session, call.model)
     state = session.models.get(call.model)
-    if state is None or call.first is None:
+    if call.first is None:
         return call.run()
     path, given = Path(call.how(call.first)), Path(call.first)
+    if state is None:
+        result = call.run()
+        with contextlib.suppress(SidecarError):
+            if path.is_file() and sidecar.find(path) and not sidecar.belongs(path):
+                sidecar.path_beside(path).unlink()
+        return result
     with staging(path) as folder:
         aside = type(call.first)(folder / given.name)
         result = call.run(**{call.seam.needs[0]: aside})

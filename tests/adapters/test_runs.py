@@ -23,6 +23,7 @@ from fragprune_plugins import Control, Fewer, Portable, Pressure, Settings
 from fragprune_plugins.adapting import Interrupted, SessionError, UsageError, read_ply
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins.loading import installed
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
@@ -141,6 +142,15 @@ def test_train_then_finetune_then_render(photographs, tmp_path):
     sidecar.path_beside(summary.model_after).unlink()
     run(["python", script, "-m", str(out), "--skip_train"], OPTIONS)
     assert truncated != [p.read_bytes() for p in sorted(renders.iterdir())]
+
+
+def test_a_model_written_over_a_pruned_one_does_not_keep_its_cutoffs(photographs, trained):
+    """Stage 1 writes where joint learning wrote: whoever read that pair refused it."""
+    (model,) = trained.glob("point_cloud/*/*.ply")
+    model.write_bytes(b"of joint learning")
+    sidecar.save(model, ThresholdStore(0))
+    run(command(photographs, trained, 10), OFF)
+    assert sidecar.find(model) is None
 
 
 PORTABLE = replace(FINETUNE, settings=Settings(iterations=8, goal=Portable()))
