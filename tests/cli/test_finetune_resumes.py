@@ -101,6 +101,7 @@ def test_what_is_not_the_same_is_not_finished(tuning, data, path, tmp_path, chan
         second.write_bytes(first.read_bytes())
     elif change == "rewritten":
         record = out.with_suffix(".fragprune.json").stat()
+        out.write_bytes(out.read_bytes() + b"\0")
         os.utime(out, ns=(record.st_atime_ns, record.st_mtime_ns + 1))
     else:
         out.with_suffix(".fragprune.json").unlink()

@@ -1,6 +1,8 @@
 """A training's output folder in place of a model, and what is known of the training then."""
 
 import json
+import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ import fragprune_plugins as fp
 from fragprune_plugins import RasterInputs
 from fragprune_plugins.errors import DatasetError, ModelFileError
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
+from fragprune_plugins.workbench.commands.opening import as_trained
 from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.finetune import work
 from fragprune_plugins.workbench.models.formats.ply import write_ply
@@ -271,6 +274,22 @@ def test_a_model_is_drawn_as_the_record_of_its_run_says(output, data, tmp_path, 
     assert np.abs(pictures[0] - pictures[1]).max() > 2
     run("view", model, "--out", tmp_path / "view.html")
     assert "trained with antialiasing, and is drawn here as 3DGS draws" in caplog.text
+
+
+def test_a_model_is_drawn_by_a_record_that_was_copied_before_it(
+    output, data, tmp_path, monkeypatch
+):
+    """Copying without times makes it older: rsync -r and stores of objects go by the alphabet."""
+    model = newest_model(output)
+    monkeypatch.chdir(tmp_path)
+    near = Path(os.path.relpath(model))
+    said = records.Recorded(Photographs(data), (model,), drawing={"compensation": "antialiasing"})
+    record = records.leave(model, "run", {"photographs": said.as_dict()})
+    os.utime(record, (1, 1))
+    assert as_trained(near)[1] == said.drawing
+    assert records.beside(near)
+    model.write_bytes(model.read_bytes() + b"\0")
+    assert not records.beside(near)
 
 
 def test_photographs_that_are_learned_from_too_are_not_said_to_be_held_out(model, tmp_path):

@@ -108,7 +108,7 @@ def as_trained(model: Path) -> tuple[bool, Mapping[str, Any]]:
         for record in filter(None, reversed(found)):
             read, path = records.recorded(record), record.path
             own = read and model.resolve() in [each.resolve() for each in read.models]
-            current = path.parent == model.parent or path.stat().st_mtime_ns >= written
+            current = path.parent.samefile(model.parent) or path.stat().st_mtime_ns >= written
             if read and own and current:
                 return read.filtered, read.drawing
     return False, {}

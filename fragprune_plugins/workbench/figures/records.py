@@ -14,7 +14,7 @@ from typing import Any
 import click
 
 from fragprune_plugins.errors import OutputError, RecordError, printable
-from fragprune_plugins.files.atomic import replacing
+from fragprune_plugins.files.atomic import digest, replacing
 from fragprune_plugins.files.reading import MEBIBYTE, UntrustedFile, lies_in
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
 
@@ -42,6 +42,7 @@ class Record:
     path: Path
     command: str  # that wrote it: run, finetune, compare or profile
     data: dict[str, Any]  # its --json output, and further data for the page
+    sha256: str | None = None  # of the result, if it is a file
 
 
 def leave(model: Path, command: str, data: dict[str, Any]) -> Path:
@@ -54,6 +55,8 @@ def leave(model: Path, command: str, data: dict[str, Any]) -> Path:
     """
     target = path_beside(model)
     content = {"format": FORMAT, "command": command, "data": portable(data, target.parent)}
+    if model.is_file():
+        content["sha256"] = digest(model)
     with replacing(target, durable=True) as temporary:
         temporary.write_text(json.dumps(strict(content), indent=1) + "\n", encoding="utf-8")
     return target
@@ -82,13 +85,16 @@ def path_beside(result: Path) -> Path:
 def beside(result: Path) -> Record | None:
     """Read the record of a result; None if there is none or the result was rewritten since.
 
+    A copy may be newer than its record: there the content tells.
+
     Raises:
         RecordError: the record cannot be read.
     """
     path = path_beside(result)
-    if not os.path.exists(path) or path.stat().st_mtime_ns < result.stat().st_mtime_ns:
+    if not os.path.exists(path):
         return None
-    return _read(path)
+    older, record = path.stat().st_mtime_ns < result.stat().st_mtime_ns, _read(path)
+    return None if older and record.sha256 != digest(result) else record
 
 
 def find(folder: Path) -> list[Record]:
@@ -267,7 +273,7 @@ def _read(path: Path) -> Record:
         command, data = content["command"], content["data"]
         if not isinstance(command, str) or not isinstance(data, dict):
             raise ValueError("command and data of other types")
-        return Record(path, command, data)
+        return Record(path, command, data, content.get("sha256"))
 
 
 def strict(value: Any) -> Any:
