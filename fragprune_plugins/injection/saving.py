@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fragprune_plugins.errors import AlignmentError, SidecarError, log
+from fragprune_plugins.errors import AlignmentError, log
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.atomic import staging
 from fragprune_plugins.hosts.adapter import CHECKPOINT_KEY, optimizer_state
@@ -23,20 +22,15 @@ from fragprune_plugins.learning.thresholds import ThresholdStore
 def on_save(session: SessionState, call: SeamCall) -> Any:
     """Have the host write its file aside, then put file and sidecar in place, both at once.
 
-    Values that are not finite stop both. A model without thresholds takes away the sidecar of
-    the file that it replaces: it is of no Gaussians that are left, and readers would refuse it.
+    Values that are not finite stop both. Without thresholds an earlier file's sidecar goes.
     """
     check_learned(session, call.model)
     state = session.models.get(call.model)
-    if call.first is None:
+    if state is None and call.first is not None:
+        sidecar.path_beside(Path(call.how(call.first))).unlink(missing_ok=True)
+    if state is None or call.first is None:
         return call.run()
     path, given = Path(call.how(call.first)), Path(call.first)
-    if state is None:
-        result = call.run()
-        with contextlib.suppress(SidecarError):
-            if path.is_file() and sidecar.find(path) and not sidecar.belongs(path):
-                sidecar.path_beside(path).unlink()
-        return result
     with staging(path) as folder:
         aside = type(call.first)(folder / given.name)
         result = call.run(**{call.seam.needs[0]: aside})

@@ -212,8 +212,7 @@ class SessionState:
     def save(self, model: Any, path: Path, whole: Path | None = None) -> None:
         """Write a model's thresholds beside the model's file ``path``.
 
-        Neutral thresholds are written in stage 2 only. A sidecar identifies files of stage 2, also
-        those of a control.
+        Neutral thresholds are written in stage 2 only: a sidecar tells its files, a control's too.
 
         Args:
             whole: the file's new content, which replaces ``path`` together with the sidecar; see
