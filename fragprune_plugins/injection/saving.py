@@ -26,10 +26,11 @@ def on_save(session: SessionState, call: SeamCall) -> Any:
     """
     check_learned(session, call.model)
     state = session.models.get(call.model)
-    if state is None and call.first is not None:
-        sidecar.path_beside(Path(call.how(call.first))).unlink(missing_ok=True)
     if state is None or call.first is None:
-        return call.run()
+        result = call.run()
+        if not (session.learn or call.first is None):
+            sidecar.path_beside(Path(call.how(call.first))).unlink(missing_ok=True)
+        return result
     path, given = Path(call.how(call.first)), Path(call.first)
     with staging(path) as folder:
         aside = type(call.first)(folder / given.name)

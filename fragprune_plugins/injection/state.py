@@ -215,8 +215,7 @@ class SessionState:
         Neutral thresholds are written in stage 2 only: a sidecar tells its files, a control's too.
 
         Args:
-            whole: the file's new content, which replaces ``path`` together with the sidecar; see
-                ``sidecar.replace_pair``. None if ``path`` is written already.
+            whole: the new content for ``sidecar.replace_pair``; None if ``path`` has it already.
 
         Raises:
             SessionError: the session does not know the model.

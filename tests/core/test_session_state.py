@@ -106,6 +106,26 @@ def test_what_a_host_writes_beside_its_model_follows_it_each_time_folders_too(tm
         assert sidecar.belongs(path)
 
 
+@pytest.mark.parametrize("learn", [True, False])
+def test_the_sidecar_of_an_earlier_file_goes_once_a_model_without_thresholds_is_written(
+    tmp_path, learn
+):
+    """While thresholds learn, a host may write a copy of the model: whoever reads it is told."""
+    path = tmp_path / "a.ply"
+    path.write_text("earlier")
+    sidecar.save(path, ThresholdStore(0))
+
+    def save(write):
+        request = call(Model(3), Role.SAVE, write, path, how=lambda call: call.first)
+        saving.on_save(state(learn=learn), request)
+
+    with pytest.raises(AttributeError):
+        save(lambda path: path.full())
+    assert sidecar.belongs(path)
+    save(lambda path: path.write_text("new"))
+    assert bool(sidecar.find(path)) == learn
+
+
 @pytest.mark.parametrize("warming", [True, False, None])
 def test_a_model_saved_before_thresholds_open_is_warned_of(tmp_path, caplog, warming):
     session = state()
