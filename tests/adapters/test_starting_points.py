@@ -100,10 +100,14 @@ def test_training_again_as_long_leaves_an_old_checkpoint_behind(photographs, out
 
 
 def test_training_again_over_a_result_of_stage_two_makes_it_stage_ones(photographs, out, started):
+    stale = sidecar.path_beside(out / ply(17))
+    thresholds = stale.read_bytes()
     run(command(photographs, out, 17), OFF)
+    assert not stale.exists()
+    stale.write_bytes(thresholds)  # as if the host had trained alone
     with pytest.raises(SidecarError, match="thresholds of another model"):
         started(out, 17)
-    sidecar.path_beside(out / ply(17)).unlink()
+    stale.unlink()
     assert f"iteration 17, {out / ply(17)}:" in started(out, 17)
 
 
