@@ -292,6 +292,15 @@ def test_a_model_is_drawn_by_a_record_that_was_copied_before_it(
     assert not records.beside(near)
 
 
+def test_a_record_that_says_nothing_of_its_result_is_believed_by_its_time_alone(tmp_path):
+    """Of a folder, or written before records did: neither is read to find that out."""
+    (tmp_path / "out").mkdir()
+    record = records.leave(tmp_path / "out", "profile", {})
+    assert records.beside(tmp_path / "out")
+    os.utime(record, (1, 1))
+    assert not records.beside(tmp_path / "out")
+
+
 def test_photographs_that_are_learned_from_too_are_not_said_to_be_held_out(model, tmp_path):
     data = tiny.write_blender(tmp_path / "scene", tiny.photographs(model))
     (data / "transforms_test.json").write_text((data / "transforms_train.json").read_text())

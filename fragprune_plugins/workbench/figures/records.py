@@ -93,8 +93,8 @@ def beside(result: Path) -> Record | None:
     path = path_beside(result)
     if not os.path.exists(path):
         return None
-    older, record = path.stat().st_mtime_ns < result.stat().st_mtime_ns, _read(path)
-    return None if older and record.sha256 != digest(result) else record
+    record, current = _read(path), path.stat().st_mtime_ns >= result.stat().st_mtime_ns
+    return record if current or (record.sha256 and record.sha256 == digest(result)) else None
 
 
 def find(folder: Path) -> list[Record]:
