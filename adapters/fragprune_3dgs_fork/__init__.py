@@ -294,8 +294,8 @@ class ForkAdapter(GraphdecoAdapter):
         fork = read_fork(repo)
         served = replace(self.command_line(repo), scripts=fork.scripts)
         kernel = partial(kernels.read_kernels, repo, kernel=kernels.SPLAT)
-        several = [each for each in fork.outputs if kernels.near(repo, each) is None]
-        codes = (kernels.ORDER, kernels.NEAR)[: 1 + bool(several)]
+        several = any(kernels.near(repo, each) is None for each in fork.outputs)
+        codes = {kernels.ORDER, kernels.DISTANCE} if several else {kernels.ORDER}
         return [
             *fork.findings,
             *(f for found in map(kernel, fork.outputs) for f in found if f.code in codes),

@@ -34,8 +34,8 @@ _NUMBERS = {
     "projections beyond this times the view:": (r"lim[xy]=([\d.]+)\*tan_fov", 1.3),
 }
 """What a rasterizer leaves out or limits, and the number that it does so by."""
-_NEEDED = 3
-"""The first of these are in every rasterizer."""
+_ALWAYS = ("fragments fainter than", "no light below", _NEAREST)
+"""Those of them that every rasterizer has."""
 _COLOURS = re.compile(r"computeColorFromSH\([^;{]*\{(.*?)\breturn([^;]+);")
 _OF_COLOURS = r"max\(\w+,(vec3\()?0\.?0?\)?\)"
 _UNLIKE = re.compile(
@@ -61,7 +61,7 @@ _LAUNCH = re.compile(r"\b(\w+)\s*(?:<[^<>;]*>)?\s*<<\s*<")
 _KERNEL = re.compile(r"__global__[^;{(]*?(?:__launch_bounds__\s*\([^)]*\)\s*)?(\w+)\s*\(")
 _LOW_PASS = 0.3
 # codes of errors that are of the picture alone: a PLY is drawn in any order, and from any distance
-ORDER, NEAR = "order", "near"
+ORDER, DISTANCE = "order", "distance"
 
 
 @dataclass(frozen=True)
@@ -234,7 +234,7 @@ class _Project:
     def _numbers(self) -> Iterator[Finding]:
         """Other numbers than those that 3DGS leaves out fragments and Gaussians by, or none."""
         whole = "".join(map(_normal, self.texts.values()))
-        for what, (pattern, usual) in list(_NUMBERS.items())[:_NEEDED]:
+        for what, (pattern, usual) in ((each, _NUMBERS[each]) for each in _ALWAYS):
             if not re.search(pattern, whole):
                 yield self._finding(self.folder, 0, f"no test for {what}", f"{usual:.4g}")
         for path, text in self.texts.items():
@@ -245,7 +245,7 @@ class _Project:
                     if not math.isclose(float(above) / float(below or 1), usual, rel_tol=0.01):
                         at = self._place(path, match[0])
                         finding = self._finding(path, at, f"{what} {match[1]}", f"{usual:.4g}")
-                        yield replace(finding, code=NEAR) if what == _NEAREST else finding
+                        yield replace(finding, code=DISTANCE) if what == _NEAREST else finding
             for match in _UNLIKE.finditer(normal):
                 code = match[0].lstrip(";{})")
                 found = f"it draws otherwise, {_short(code)}"

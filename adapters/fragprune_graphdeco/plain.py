@@ -15,7 +15,7 @@ from functools import lru_cache
 from fragprune_graphdeco import reading, saved
 from fragprune_graphdeco.call import RASTERIZER
 from fragprune_graphdeco.drawing import Drawing, arguments, drawing_in
-from fragprune_graphdeco.kernels import NEAR, ORDER, SPLAT, read_kernels
+from fragprune_graphdeco.kernels import DISTANCE, ORDER, SPLAT, read_kernels
 from fragprune_graphdeco.photographs import unlike
 from fragprune_graphdeco.reading import ModelClass
 from fragprune_graphdeco.syntax import assigned, every, is_off, off_by_default, passed, text_of
@@ -215,7 +215,7 @@ def _of_kernel(repo: HostRepo) -> Iterator[str]:
         for node in nodes(repo.tree(module)):
             if isinstance(node, ast.ImportFrom) and any(RASTERIZER in a.name for a in node.names):
                 for finding in read_kernels(repo, repo.absolute(module, node), SPLAT):
-                    if finding.level == "error" and finding.code not in (ORDER, NEAR):
+                    if finding.level == "error" and finding.code not in (ORDER, DISTANCE):
                         yield f"its rasterizer draws otherwise: {finding.found}, {finding.where}"
 
 

@@ -322,7 +322,7 @@ class HostAdapter(ABC):
         """(N,) activated opacities."""
 
     def view(self, camera: Any) -> Hashable:
-        """A key of a training view, or a tuple of several; the id of a camera that is kept."""
+        """A key of a training view, or a tuple of several; by default the camera's id."""
         return id(camera)
 
     def model_of(self, call: SeamCall) -> Any:

@@ -35,11 +35,10 @@ def on_save(session: SessionState, call: SeamCall) -> Any:
     with staging(path) as folder:
         aside = type(call.first)(folder / given.name)
         result = call.run(**{call.seam.needs[0]: aside})
-        for other in [*folder.rglob("*")]:
-            if other.is_file() and other != folder / path.name:
-                beside = path.parent / other.relative_to(folder)
-                beside.parent.mkdir(parents=True, exist_ok=True)
-                other.replace(beside)
+        for other in [f for f in folder.rglob("*") if f.is_file() and f != folder / path.name]:
+            beside = path.parent / other.relative_to(folder)
+            beside.parent.mkdir(parents=True, exist_ok=True)
+            other.replace(beside)
         session.save(call.model, path, folder / path.name)
     return result
 

@@ -50,7 +50,8 @@ def on_attach(session: SessionState, call: SeamCall) -> Any:
     means = session.adapter.means(model)
     if state is not None and not kept:
         if not state.store.neutral:
-            log.warning("%s: new Gaussians, %d thresholds begin anew", call.seam, len(state.store))
+            said = "%s: new Gaussians; %d thresholds begin anew, unless a checkpoint has them"
+            log.warning(said, call.seam, len(state.store))
         with session.changing(state.store, "training_setup"):
             state.store.replace(len(means))
     if not session.learn:

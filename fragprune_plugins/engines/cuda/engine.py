@@ -17,7 +17,7 @@ from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats
 
 @cache
 def _driver(why_not: str | None) -> Driver:
-    """The driver of this process, where it can run: what it has loaded, it does not unload."""
+    """The driver of this process while ``missing`` says the same: it keeps what it has loaded."""
     return Driver()
 
 
