@@ -59,7 +59,7 @@ def kept(
     if not views or (keep == "auto" and not shots):
         raise InputError("keep", "no view to judge by", "at least one", "Pass views of the model.")
     bar = tqdm(views, "scoring Gaussians", unit="view", leave=None, disable=not progress)
-    scores = removal_error(model, model.falloff, bar, drawer)
+    scores = removal_error(model, bar, drawer)
     if keep != "auto":
         return best(scores, keep)
     spared = SPARE * _error(model, shots, drawer) * len(views) / len(shots)
@@ -147,9 +147,7 @@ def best(scores: Tensor, share: float) -> Tensor:
     return kept
 
 
-def removal_error(
-    model: Model, thresholds: Tensor | None, views: Iterable[View], engine: Engine
-) -> Tensor:
+def removal_error(model: Model, views: Iterable[View], engine: Engine) -> Tensor:
     """Squared change of all pictures if this Gaussian alone went, estimated; the same every time.
 
     A pixel is linear in a fragment's alpha, so its change is alpha times the gradient by alpha.
@@ -166,7 +164,7 @@ def removal_error(
     scores = torch.zeros_like(opacities)
     for view in views:
         inputs = RasterInputs(view, splats, planes=(), **model.rules)
-        image = engine.rasterize(inputs, thresholds).image
+        image = engine.rasterize(inputs, model.falloff).image
         signs = torch.randint(0, 2, image.shape, generator=stream, device=where)
         signs = signs.mul(2).sub(1).to(image)
         (slope,) = torch.autograd.grad(image, opacities, signs)

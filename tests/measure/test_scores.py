@@ -22,15 +22,15 @@ def scene(truncated):
     model.opacity[:2] = -6.0  # faint: no fragment
     model.xyz[2] += 40  # in no picture
     stream = torch.Generator().manual_seed(1)
-    thresholds = 0.02 + 0.6 * torch.rand(COUNT, generator=stream) if truncated else None
-    return model, thresholds
+    thresholds = ThresholdStore.from_falloff(0.02 + 0.6 * torch.rand(COUNT, generator=stream))
+    return replace(model, thresholds=thresholds if truncated else None)
 
 
-def pixels(model, thresholds):
+def pixels(model):
     """For each pixel of each view: the fragments that are drawn, and the background."""
     for view in VIEWS:
         inputs = scenes.cast(RasterInputs(view, model.splats()), torch.float64)
-        ordered = naive.splats_of(inputs, thresholds)
+        ordered = naive.splats_of(inputs, model.falloff)
         for y in range(view.height):
             for x in range(view.width):
                 records = [r for r in naive.records_at(ordered, x, y)[0] if r.drawn]
@@ -49,27 +49,27 @@ def colour(fragments, background):
 @pytest.mark.parametrize("truncated", [False, True], ids=["whole", "truncated"])
 def test_the_removal_error_is_estimated_without_bias(truncated):
     """Over many pixels the relative error is about sqrt(2 / times that a view is given)."""
-    model, thresholds = scene(truncated)
+    model = scene(truncated)
     truth = torch.zeros(COUNT)
-    for records, background in pixels(model, thresholds):
+    for records, background in pixels(model):
         pairs = [(r.alpha, r.color) for r in records]
         whole = colour(pairs, background)
         for k, record in enumerate(records):
             without = colour(pairs[:k] + pairs[k + 1 :], background)
             truth[record.row] += sum((a - b) ** 2 for a, b in zip(whole, without, strict=True))
     times = 400
-    got = scores.removal_error(model, thresholds, times * VIEWS, create_engine("auto")) / times
+    got = scores.removal_error(model, times * VIEWS, create_engine("auto")) / times
     spread = (2 / times) ** 0.5  # as if only one view counted
     assert ((got - truth).abs() <= 4 * spread * truth + 1e-9).all()
     assert (got[:3] == 0).all()
 
 
 def test_the_removal_error_is_the_same_every_time():
-    model, _ = scene(False)
+    model = scene(False)
     torch.manual_seed(1)
-    first = scores.removal_error(model, None, VIEWS, create_engine("auto"))
+    first = scores.removal_error(model, VIEWS, create_engine("auto"))
     torch.manual_seed(2)
-    assert torch.equal(first, scores.removal_error(model, None, VIEWS, create_engine("auto")))
+    assert torch.equal(first, scores.removal_error(model, VIEWS, create_engine("auto")))
 
 
 @pytest.mark.parametrize(("share", "count"), [(1.0, 5), (0.6, 3), (0.5, 2), (0.01, 1)])
@@ -87,16 +87,16 @@ def test_a_share_that_is_none_is_refused(share):
 
 
 def test_thresholds_and_moments_stay_with_their_rows():
-    model, _ = scene(False)
+    model = scene(False)
     store = ThresholdStore(len(model))
     store.open(model.splats().opacities)
     store.logits.grad = torch.linspace(-1, 1, len(model))
     store.step(0.05)
-    engine = create_engine("auto")
-    smaller = scores.keep_best(replace(model, thresholds=store), 0.5, VIEWS, engine=engine)
-    kept = scores.best(scores.removal_error(model, store.values.detach(), VIEWS, engine), 0.5)
+    engine, model = create_engine("auto"), replace(model, thresholds=store)
+    smaller = scores.keep_best(model, 0.5, VIEWS, engine=engine)
+    kept = scores.best(scores.removal_error(model, VIEWS, engine), 0.5)
     assert len(smaller) == COUNT // 2
-    expected = tiny.state(replace(model, thresholds=store).keep(kept))
+    expected = tiny.state(model.keep(kept))
     assert all(torch.equal(each, expected[k]) for k, each in tiny.state(smaller).items())
 
 
@@ -109,7 +109,7 @@ def test_what_can_be_spared_costs_no_more_than_its_share_of_the_error(tmp_path):
     with torch.no_grad():
         pictures = [(engine.rasterize(RasterInputs(s.view, splats), None).image, s) for s in shots]
     error = sum(float((p.clamp(0, 1) - s.image).square().sum()) for p, s in pictures)
-    each = scores.removal_error(model, None, [s.view for s in shots], engine)
+    each = scores.removal_error(model, [s.view for s in shots], engine)
     gone = torch.tensor([not (left.xyz == row).all(dim=1).any() for row in model.xyz])
     assert 0 < int(gone.sum()) == len(model) - len(left)
     spent = float(each[gone].sum())
@@ -121,7 +121,7 @@ def test_six_in_ten_stay_even_if_all_can_be_spared(tmp_path, monkeypatch):
     truth = tiny.random_model()
     monkeypatch.setattr(scores, "SPARE", 1e9)
     shots = tiny.dataset_in_memory(tmp_path, truth).train
-    worth = scores.removal_error(truth, None, [s.view for s in shots], create_engine("auto"))
+    worth = scores.removal_error(truth, [s.view for s in shots], create_engine("auto"))
     left = scores.keep_needed(truth, shots)
     assert torch.equal(left.xyz, truth.xyz[scores.best(worth, 0.6)])
 
@@ -136,6 +136,6 @@ def test_the_budget_is_of_a_view_whichever_views_must_not_change(tmp_path):
     with torch.no_grad():
         picture = engine.rasterize(inputs, None).image.clamp(0, 1)
     allowed = scores.SPARE * float((picture - seen[0].image).square().sum()) * len(views)
-    each = scores.removal_error(model, None, views, engine)
+    each = scores.removal_error(model, views, engine)
     assert len(left) == len(model) - int((each.sort().values.cumsum(0) <= allowed).sum())
     assert len(left) != len(scores.keep_needed(model, seen, engine=engine))

@@ -4,31 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Literal
 
-from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.goals import Control, Portable, Pressure
 from fragprune_plugins.learning.pressure import LEAST_PRESSURE
-from fragprune_plugins.learning.schedule import Settings, Train
+from fragprune_plugins.learning.schedule import Settings
 from lab.rules import Rule, Start, alpha_cutoff, falloff_threshold, shrunk, without_faint
+from lab.scores import SCORES
 
 _FALLOFFS = (0.03, 0.07, 0.12, 0.2)
 _ALPHA_LEVELS = (4, 8, 12, 16)
 _PRESSURES = tuple(factor * LEAST_PRESSURE for factor in (0.5, 1, 2, 4))
 _AREA_PRESSURES = tuple(factor * LEAST_PRESSURE for factor in (2, 4))
-_SHRINKS = (0.7,)
-_FAINT = (0.15,)
-
-
-_SCORES = (
-    "removal-error",
-    "opacity",
-    "total-weight",
-    "largest-weight",
-    "light-gaussian",
-    "mini-splatting",
-    "falloff-gradient",
-)
 _KEPT = 0.6
 
 
@@ -109,14 +96,8 @@ def _control(settings: Settings) -> Settings:
     return replace(settings, goal=Control())
 
 
-def rules(iterations: int, train: Train | None = None) -> Experiment:
-    """Learned thresholds against one threshold for all, everything trained equally long.
-
-    Args:
-        iterations: of every arm.
-        train: what moves in every arm; all parameters when None.
-    """
-    settings = Settings(iterations=iterations, train=train or "all")
+def rules(settings: Settings) -> Experiment:
+    """Learned thresholds against one threshold for all, everything trained equally long."""
     return Experiment(
         "rules",
         "Are learned thresholds better than one falloff threshold, or one alpha cut-off, for all "
@@ -134,61 +115,9 @@ def rules(iterations: int, train: Train | None = None) -> Experiment:
     )
 
 
-def moves(iterations: int, train: Train | None = None) -> Experiment:
-    """What should move beside the thresholds, each choice with its own control.
-
-    Args:
-        iterations: of every arm.
-        train: must be None, because it is what the arms differ in.
-
-    Raises:
-        UsageError: ``train`` was given.
-    """
-    if train is not None:
-        raise UsageError(
-            "--train",
-            f"{train} for the experiment moves",
-            "none, because its arms differ in what moves",
-            "Remove --train.",
-        )
-    every = [Settings(iterations=iterations, train=each) for each in get_args(Train)]
-    return Experiment(
-        "moves",
-        "Which parameters should move beside the thresholds?",
-        (
-            *(Arm("control", each.train, _control(each)) for each in every),
-            *(Arm("learned", each.train, each) for each in every),
-        ),
-    )
-
-
-def iterations(longest: int, train: Train | None = None) -> Experiment:
-    """How long stage 2 should last: a 25th, a fifth and all of the longest.
-
-    Args:
-        longest: iterations of the longest arms.
-        train: what moves in every arm; all parameters when None.
-    """
-    lengths = dict.fromkeys(max(1, round(longest / share)) for share in (25, 5, 1))
-    every = [Settings(iterations=length, train=train or "all") for length in lengths]
-    return Experiment(
-        "iterations",
-        "How many iterations does stage 2 need, and what do they cost?",
-        (
-            *(Arm("control", f"{each.iterations:,}", _control(each)) for each in every),
-            *(Arm("learned", f"{each.iterations:,}", each) for each in every),
-        ),
-    )
-
-
-def overfitting(longest: int, train: Train | None = None) -> Experiment:
-    """Training views beside held-out ones, over the length of stage 2 and of truncation in it.
-
-    Args:
-        longest: iterations of the longest arms.
-        train: what moves in every arm; all parameters when None.
-    """
-    settings = Settings(iterations=longest, train=train or "all")
+def overfitting(settings: Settings) -> Experiment:
+    """Training views beside held-out ones, over the length of stage 2 and of truncation in it."""
+    longest = settings.iterations
     lengths = dict.fromkeys(max(1, round(longest * share)) for share in (0.1, 0.2, 0.4, 1))
     every = [replace(settings, iterations=length) for length in lengths]
     later = dict.fromkeys(round(longest * share) for share in (0.4, 0.6, 0.8))
@@ -205,16 +134,10 @@ def overfitting(longest: int, train: Train | None = None) -> Experiment:
     )
 
 
-def schedules(iterations: int, train: Train | None = None) -> Experiment:
-    """When thresholds learn: after everything else, together with it, or in turns.
-
-    Args:
-        iterations: of every arm.
-        train: what moves in every arm; all parameters when None.
-    """
-    settings = Settings(iterations=iterations, train=train or "all")
-    later = dict.fromkeys(round(iterations * share) for share in (0.5, 0.8))
-    turns = dict.fromkeys(max(1, iterations // number) for number in (10, 40))
+def schedules(settings: Settings) -> Experiment:
+    """When thresholds learn: after everything else, together with it, or in turns."""
+    later = dict.fromkeys(round(settings.iterations * share) for share in (0.5, 0.8))
+    turns = dict.fromkeys(max(1, settings.iterations // number) for number in (10, 40))
     return Experiment(
         "schedules",
         "Should thresholds learn after everything else, together with it, or in turns?",
@@ -227,42 +150,34 @@ def schedules(iterations: int, train: Train | None = None) -> Experiment:
     )
 
 
-def primitives(iterations: int, train: Train | None = None) -> Experiment:
-    """Pruning of whole Gaussians by a score, then equal training without and with truncation.
-
-    Args:
-        iterations: of every arm.
-        train: what moves in every arm; all parameters when None.
-    """
-    learned = Settings(iterations=iterations, train=train or "all")
-    control = _control(learned)
-    prunings = [Pruning(score, _KEPT) for score in _SCORES]
-    prunings += [Pruning(_SCORES[0], keep) for keep in (0.8, 0.4)]
+def primitives(settings: Settings) -> Experiment:
+    """Pruning of whole Gaussians by a score, then equal training without and with truncation."""
+    control = _control(settings)
+    prunings = [Pruning(score, _KEPT) for score in SCORES]
+    prunings += [Pruning("removal-error", keep) for keep in (0.8, 0.4)]
     return Experiment(
         "primitives",
         "What do learned thresholds add to the pruning of whole Gaussians, if everything trains "
         "equally long?",
         (
             Arm("control", "", control),
-            Arm("learned", "", learned),
+            Arm("learned", "", settings),
             *(
-                Arm(f"{each.score}{more}", f"{each.keep:.0%}", settings, pruning=each)
+                Arm(f"{each.score}{more}", f"{each.keep:.0%}", trained, pruning=each)
                 for each in prunings
-                for more, settings in (("", control), (" + learned", learned))
+                for more, trained in (("", control), (" + learned", settings))
             ),
         ),
     )
 
 
-def portable(iterations: int, train: Train | None = None) -> Experiment:
+def portable(settings: Settings) -> Experiment:
     """Pressure on the ellipses' area against simple ways to a lighter model without thresholds.
 
-    Args:
-        iterations: of every arm.
-        train: must be None or "all": shapes have to move.
+    Raises:
+        UsageError: not all parameters move; shapes have to.
     """
-    settings = Settings(iterations=iterations, train=train or "all", goal=Portable())
-    control = _control(settings)
+    settings, control = replace(settings, goal=Portable()), _control(settings)
     return Experiment(
         "portable",
         "For viewers that know no thresholds: is pressure on the ellipses' area better than to "
@@ -273,24 +188,22 @@ def portable(iterations: int, train: Train | None = None) -> Experiment:
                 Arm("portable", f"λ={pressure:g}", replace(settings, goal=Portable(pressure)))
                 for pressure in _AREA_PRESSURES
             ),
-            *(Arm("shrunk", f"{factor:g}", control, start=shrunk(factor)) for factor in _SHRINKS),
-            *(Arm("without faint", f"{o:g}", control, start=without_faint(o)) for o in _FAINT),
+            Arm("shrunk", "0.7", control, start=shrunk(0.7)),
+            Arm("without faint", "0.15", control, start=without_faint(0.15)),
             Arm("portable", "default", settings),
         ),
         over="area",
     )
 
 
-EXPERIMENTS: dict[str, Callable[[int, Train | None], Experiment]] = {
+EXPERIMENTS: dict[str, Callable[[Settings], Experiment]] = {
     "rules": rules,
-    "moves": moves,
-    "iterations": iterations,
     "overfitting": overfitting,
     "schedules": schedules,
     "primitives": primitives,
     "portable": portable,
 }
-"""By name: makes the experiment from the iterations of its longest arms and from what moves."""
+"""By name: makes the experiment from the settings of its longest arms."""
 
 QUESTIONS = {
     "fragments": "Which Gaussians own the fragments, and how many fragments are hardly seen?",

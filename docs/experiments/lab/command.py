@@ -11,7 +11,7 @@ import click
 
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.interruption import sigterm_interrupts
-from fragprune_plugins.learning.schedule import FINETUNE_ITERATIONS
+from fragprune_plugins.learning.schedule import FINETUNE_ITERATIONS, Settings
 from fragprune_plugins.workbench.commands.command import Command, Group, Report
 from fragprune_plugins.workbench.commands.opening import open_engine, photographs_for
 from fragprune_plugins.workbench.commands.options import (
@@ -93,7 +93,9 @@ _training_options = bundled(
     click.option(
         "--train",
         type=click.Choice(["opacity", "appearance", "all"]),
-        help="Parameters that move in every arm; default all. Not for moves.",
+        default="all",
+        show_default=True,
+        help="Parameters that move in every arm.",
     ),
     _seeds_option("0"),
     engine_options(),
@@ -125,7 +127,7 @@ def _train(
     if iters is not None and scale is not None:
         raise UsageError("options", "--iters with --scale", "one of the two", "Remove one.")
     longest = iters or max(1, round(FINETUNE_ITERATIONS * (1.0 if scale is None else scale)))
-    experiment = EXPERIMENTS[name](longest, train)
+    experiment = EXPERIMENTS[name](Settings(iterations=longest, train=train))
 
     from lab import results, running
 
@@ -159,7 +161,7 @@ def _report(found: Findings) -> Report:
 
 
 for _name, _make in EXPERIMENTS.items():
-    _asks = _make(FINETUNE_ITERATIONS, None).asks
+    _asks = _make(Settings()).asks
     command.command(
         _name, cls=Command, short_help=_asks, help=_TRAINING.format(asks=_asks, name=_name)
     )(_training_options(partial(_train, _name)))

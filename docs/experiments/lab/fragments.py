@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
+from tqdm import tqdm
 
 from fragprune_plugins.constants import ALPHA_MIN
 from fragprune_plugins.engines import Engine
@@ -21,7 +23,7 @@ from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.figures.pictures import COLOURS, LABEL
 from fragprune_plugins.workbench.scenes.dataset import Shot, load_photographs
 from lab.catalogue import QUESTIONS
-from lab.figures import new_figure, save_figure
+from lab.figures import save_figure
 from lab.folder import Findings, Folder, markdown
 from lab.scene import describe_drawing, describe_photographs, load_columns
 
@@ -59,8 +61,6 @@ def run(
         RecordError: the folder holds this experiment in another configuration, or a file of it
             cannot be read.
     """
-    from tqdm import tqdm
-
     columns, said = load_columns(paths, device)
     dataset = load_photographs(photographs).to(device)
     asked = {
@@ -193,7 +193,7 @@ whatever the threshold.
 
 
 def _plot(path: Path, parts: Mapping[str, dict[str, Any]], shot: Shot) -> None:
-    figure = new_figure(13, 8.5)
+    figure = Figure(figsize=(13, 8.5), layout="constrained")
     halves: Any = figure.subfigures(2, 1, height_ratios=[5.5, 3.5])
     (owned, curve, weight), (opacity, radius, light) = halves[0].subplots(2, 3)
     wide = 0.8 / len(parts)

@@ -9,8 +9,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
+
 from lab.catalogue import Experiment
-from lab.figures import new_figure, save_figure
+from lab.figures import save_figure
 from lab.folder import Findings, Folder, markdown
 from lab.running import ENLARGED, Outcome
 
@@ -145,7 +147,7 @@ def _plot(path: Path, experiment: Experiment, table: Sequence[dict[str, Any]]) -
 
     A series "A + B" has the colour of "A", and squares.
     """
-    figure = new_figure(15, 5)
+    figure = Figure(figsize=(15, 5), layout="constrained")
     panels = _PANELS[experiment.over]
     subplots = figure.subplots(1, len(panels), squeeze=False)[0]
     series_of = list(dict.fromkeys(row["series"] for row in table))

@@ -38,10 +38,6 @@ class Rule:
     name: str
     thresholds: Callable[[Tensor], Tensor]
 
-    def __call__(self, opacities: Tensor) -> Tensor:
-        """The thresholds (N,) for activated opacities (N,)."""
-        return self.thresholds(opacities)
-
 
 def finetune_by(
     rule: Rule, model: Model, dataset: Dataset, settings: Settings, **options: Any
@@ -62,11 +58,11 @@ def finetune_by(
     return result
 
 
+@dataclass(frozen=True)
 class _Ruled:
     """A plugin that puts the rule's thresholds into the store, and draws with them."""
 
-    def __init__(self, rule: Rule) -> None:
-        self.rule = rule
+    rule: Rule
 
     @hookimpl
     def fragprune_truncate(self, inputs: RasterInputs, store: ThresholdStore) -> Tensor:
@@ -75,7 +71,7 @@ class _Ruled:
 
 
 def _follow(rule: Rule, store: ThresholdStore, opacities: Tensor) -> None:
-    store.place(torch.logit(rule(opacities)))
+    store.place(torch.logit(rule.thresholds(opacities)))
 
 
 def falloff_threshold(tau: float) -> Rule:
@@ -105,15 +101,11 @@ class Start:
 
     Attributes:
         name: says which change, with its numbers; recorded with results.
-        model: gives the changed model.
+        change: gives the changed model.
     """
 
     name: str
-    model: Callable[[Model], Model]
-
-    def __call__(self, model: Model) -> Model:
-        """The changed model."""
-        return self.model(model)
+    change: Callable[[Model], Model]
 
 
 def shrunk(factor: float) -> Start:

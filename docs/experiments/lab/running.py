@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tqdm import tqdm
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import Interrupted, Terminated
@@ -17,7 +18,12 @@ from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.learning.schedule import Schedule, Settings, StepPlan
 from fragprune_plugins.plugins.hooks import schedule_for
-from fragprune_plugins.workbench.figures.evaluate import Candidate, frame_times, measure_all
+from fragprune_plugins.workbench.figures.evaluate import (
+    Candidate,
+    enlarged,
+    frame_times,
+    measure_all,
+)
 from fragprune_plugins.workbench.finetune.api import FinetuneResult, finetune
 from fragprune_plugins.workbench.finetune.resuming import described
 from fragprune_plugins.workbench.models import model as models
@@ -89,8 +95,6 @@ def run(
         Interrupted: Ctrl-C; the arms that were finished stay.
         Terminated: SIGTERM; likewise.
     """
-    from tqdm import tqdm
-
     splat = models.load(model, truncation=False, device=device)
     dataset = load_photographs(photographs).to(device)
     asked = _configuration(experiment, model, photographs, dataset, engine, device, seeds)
@@ -126,13 +130,11 @@ class Scores:
 
     def prune(self, pruning: Pruning) -> Model:
         """The Gaussians that stay."""
-        from tqdm import tqdm
-
         name = pruning.score
         if name not in self._known:
             hidden = not self._progress
             views = tqdm(self._views, disable=hidden, desc=name, unit="view", leave=None)
-            self._known[name] = SCORES[name](self._splat, None, views, self._engine)
+            self._known[name] = SCORES[name](self._splat, views, self._engine)
         return self._splat.keep(best(self._known[name], pruning.keep))
 
 
@@ -150,7 +152,7 @@ def _outcome(
     begun = splat if arm.pruning is None else scores.prune(arm.pruning)
     train = finetune if arm.rule is None else partial(finetune_by, arm.rule)
     result = train(
-        begun if arm.start is None else arm.start(begun),
+        begun if arm.start is None else arm.start.change(begun),
         dataset,
         settings,
         schedule=_schedule(arm, settings),
@@ -200,18 +202,15 @@ def _measure(
 ) -> list[dict[str, Any]]:
     """Measurements before and after, timed in turns at both sizes."""
     candidates = [Candidate(splat), Candidate(result.model)]
-    views = [
-        replace(s.view, width=ENLARGED * s.view.width, height=ENLARGED * s.view.height)
-        for s in dataset.test
-    ]
+    views = [enlarged(shot.view, ENLARGED) for shot in dataset.test]
     measured = measure_all(candidates, dataset.test, engine=engine)
-    enlarged = frame_times(candidates, views, engine)
+    large_frames = frame_times(candidates, views, engine)
     learned_from = measure_all(candidates, dataset.train, engine=engine, repeats=1)
     return [
         usual
         | {f"{key}_enlarged": value for key, value in large.items()}
         | {f"{key}_training": seen[key] for key in ("psnr", "ssim")}
-        for usual, large, seen in zip(measured, enlarged, learned_from, strict=True)
+        for usual, large, seen in zip(measured, large_frames, learned_from, strict=True)
     ]
 
 

@@ -13,8 +13,8 @@ from fragprune_plugins.files.model import Model
 from fragprune_plugins.types import RasterInputs, RasterOutputs, View
 from fragprune_plugins.workbench.pruning import removal_error
 
-Score = Callable[[Model, Tensor | None, Iterable[View], Engine], Tensor]
-"""Gives (N,) from N Gaussians, their thresholds (N,) in falloff or None, views, and an engine.
+Score = Callable[[Model, Iterable[View], Engine], Tensor]
+"""Gives (N,) from N Gaussians, with their thresholds if they have any, views, and an engine.
 
 The larger the number, the more the Gaussian is worth.
 """
@@ -22,50 +22,36 @@ The larger the number, the more the Gaussian is worth.
 VOLUME_POWER = 0.1
 """LightGaussian's exponent of a Gaussian's volume (``v_pow``)."""
 
-GAUSSIAN_PRICE = 30.0
-"""Fragments that a Gaussian itself costs in a frame: its projection and its places in lists.
-
-On the cpu engine 21 to 94, by the stages of six frames of three scenes, 90x160 to 1024x1024 pixels.
-"""
-
 
 @torch.no_grad()
-def opacity(
-    model: Model, thresholds: Tensor | None, views: Iterable[View], engine: Engine
-) -> Tensor:
+def opacity(model: Model, views: Iterable[View], engine: Engine) -> Tensor:
     """The opacity, by which 3DGS itself prunes."""
     return model.splats().opacities
 
 
-def total_weight(
-    model: Model, thresholds: Tensor | None, views: Iterable[View], engine: Engine
-) -> Tensor:
+def total_weight(model: Model, views: Iterable[View], engine: Engine) -> Tensor:
     """Sum of the weights alpha T of all fragments: the light that it gives to all views.
 
     The score of LP-3DGS (``bw_score``) and, for Gaussians that win a pixel, of Mini-Splatting
     indoors (``imp_metric``).
     """
-    return _summed(model, thresholds, views, engine, lambda drawn: drawn.weights_per_gaussian)
+    return _summed(model, views, engine, lambda drawn: drawn.weights_per_gaussian)
 
 
-def largest_weight(
-    model: Model, thresholds: Tensor | None, views: Iterable[View], engine: Engine
-) -> Tensor:
+def largest_weight(model: Model, views: Iterable[View], engine: Engine) -> Tensor:
     """The largest weight alpha T of any fragment in any view (RadSplat 2024; LP-3DGS ``mw_score``).
 
     No engine gives it: it reads every fragment from the reference engine, seconds for a small view.
     """
     scores = model.opacity.new_zeros(len(model))
     for inputs in _inputs(model, views):
-        for tile in fragments(inputs, thresholds):
+        for tile in fragments(inputs, model.falloff):
             largest = tile.weights.amax(dim=1)
             scores[tile.rows] = scores[tile.rows].maximum(largest)
     return scores
 
 
-def light_gaussian(
-    model: Model, thresholds: Tensor | None, views: Iterable[View], engine: Engine
-) -> Tensor:
+def light_gaussian(model: Model, views: Iterable[View], engine: Engine) -> Tensor:
     """Opacity x fragments x volume^0.1: LightGaussian's score (2023), up to a common factor.
 
     As its code has it (``calculate_v_imp_score``; its rasterizer adds an opacity for each fragment
@@ -74,13 +60,11 @@ def light_gaussian(
     splats = model.splats()
     assert splats.scales is not None
     volume = splats.scales.detach().prod(dim=1)
-    hits = _summed(model, thresholds, views, engine, lambda drawn: drawn.fragments_per_gaussian)
+    hits = _summed(model, views, engine, lambda drawn: drawn.fragments_per_gaussian)
     return splats.opacities.detach() * hits * volume**VOLUME_POWER
 
 
-def mini_splatting(
-    model: Model, thresholds: Tensor | None, views: Iterable[View], engine: Engine
-) -> Tensor:
+def mini_splatting(model: Model, views: Iterable[View], engine: Engine) -> Tensor:
     """Sum over views of the mean weight of its fragments, where it wins a pixel of the view.
 
     Mini-Splatting's importance outdoors (2024, ``imp_metric``): 0 for who never has the largest
@@ -94,12 +78,10 @@ def mini_splatting(
         assert drawn.wins_per_gaussian is not None
         return torch.where(drawn.wins_per_gaussian > 0, weights / counts.clamp(min=1), 0.0)
 
-    return _summed(model, thresholds, views, engine, mean_weight)
+    return _summed(model, views, engine, mean_weight)
 
 
-def falloff_gradient(
-    model: Model, thresholds: Tensor | None, views: Iterable[View], engine: Engine
-) -> Tensor:
+def falloff_gradient(model: Model, views: Iterable[View], engine: Engine) -> Tensor:
     """Sum over fragments of the squared gradient by the falloff: Speedy-Splat's score (2024).
 
     The gradient is that of the sum of the pixel's three channels (``score_func``). No engine gives
@@ -108,7 +90,7 @@ def falloff_gradient(
     scores = model.opacity.new_zeros(len(model))
     for inputs in _inputs(model, views):
         background = inputs.view.background.sum()
-        for tile in fragments(inputs, thresholds):
+        for tile in fragments(inputs, model.falloff):
             light, color = tile.light, tile.color.sum(dim=1)[:, None]
             given = tile.alpha * light * color
             behind = given.sum(dim=0) - given.cumsum(dim=0)
@@ -119,25 +101,8 @@ def falloff_gradient(
     return scores
 
 
-def removal_error_per_price(
-    model: Model, thresholds: Tensor | None, views: Iterable[View], engine: Engine
-) -> Tensor:
-    """``removal_error`` over ``price``: what it gives for what it costs."""
-    views = list(views)
-    worth = removal_error(model, thresholds, views, engine)
-    return worth / price(model, thresholds, views, engine)
-
-
-def price(model: Model, thresholds: Tensor | None, views: Iterable[View], engine: Engine) -> Tensor:
-    """What a Gaussian costs in a frame, in fragments: those drawn, mean over views, and its own."""
-    views = list(views)
-    drawn = _summed(model, thresholds, views, engine, lambda drawn: drawn.fragments_per_gaussian)
-    return drawn / len(views) + GAUSSIAN_PRICE
-
-
 SCORES: dict[str, Score] = {
     "removal-error": removal_error,
-    "removal-error-per-price": removal_error_per_price,
     "opacity": opacity,
     "total-weight": total_weight,
     "largest-weight": largest_weight,
@@ -158,7 +123,6 @@ def _inputs(model: Model, views: Iterable[View]) -> Iterator[RasterInputs]:
 @torch.no_grad()
 def _summed(
     model: Model,
-    thresholds: Tensor | None,
     views: Iterable[View],
     engine: Engine,
     figure: Callable[[RasterOutputs], Tensor | None],
@@ -166,7 +130,7 @@ def _summed(
     """(N,) sum over views of a figure (N,)."""
     scores = model.opacity.new_zeros(len(model))
     for inputs in _inputs(model, views):
-        each = figure(engine.rasterize(inputs, thresholds))
+        each = figure(engine.rasterize(inputs, model.falloff))
         assert each is not None
         scores += each
     return scores

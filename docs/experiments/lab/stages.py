@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from matplotlib.figure import Figure
+from tqdm import tqdm
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.hosts.photographs import Photographs
@@ -20,7 +22,7 @@ from fragprune_plugins.workbench.figures.clock import timed
 from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
 from lab.catalogue import QUESTIONS
-from lab.figures import new_figure, save_figure
+from lab.figures import save_figure
 from lab.folder import Findings, Folder, markdown
 from lab.scene import describe_drawing, describe_photographs, load_columns
 
@@ -64,8 +66,6 @@ def run(
         RecordError: the folder holds this experiment in another configuration, or a file of it
             cannot be read.
     """
-    from tqdm import tqdm
-
     sizes = SIZES if sizes is None else sizes
     columns, said = load_columns(paths, device)
     dataset = load_photographs(photographs).to(device)
@@ -204,7 +204,7 @@ def _plot(path: Path, rows: Sequence[dict[str, Any]], stages: Sequence[str]) -> 
     """The quickest round's stages for each model and size, with the median frame's error."""
     sizes = list(dict.fromkeys(row["size"] for row in rows))
     labels = list(dict.fromkeys(row["model"] for row in rows))
-    figure = new_figure(2.6 * len(sizes) + 0.5, 3.6)
+    figure = Figure(figsize=(2.6 * len(sizes) + 0.5, 3.6), layout="constrained")
     for axes, size in zip(figure.subplots(1, len(sizes), squeeze=False)[0], sizes, strict=True):
         mine = {(row["model"], row["stage"]): row for row in rows if row["size"] == size}
         base = [0.0] * len(labels)

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
@@ -182,7 +181,6 @@ def save_learning(
     """
     rows = 1 if thresholds is None else 2
     figure = Figure(figsize=(8, 2.8 * rows), layout="constrained", facecolor="none")
-    FigureCanvasAgg(figure)
     loss, fragments, *others = figure.subplots(rows, 2).flat
     steps = np.array([row["step"] for row in curves])
     window = max(1, min(50, len(steps) // 4))

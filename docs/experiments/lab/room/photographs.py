@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.workbench.models.model import writable_folder
@@ -146,41 +147,28 @@ def surface_points(
     return points, (np.concatenate(colours) * 255 + 0.5).astype(np.uint8)
 
 
-def make_scene(
-    folder: Path,
-    settings: SceneSettings | None = None,
-    progress: Callable[[int, int], None] | None = None,
-) -> list[Photo]:
+def make_scene(folder: Path, settings: SceneSettings | None = None) -> None:
     """Write ``images/`` and ``sparse/0/`` in COLMAP's text form.
 
     Args:
         folder: folder of the scene; made if it is missing.
         settings: the scene's settings; None for the defaults.
-        progress: called with (done, total) after each photograph.
-
-    Returns:
-        The cameras, in the order of their names.
 
     Raises:
         OutputError: the folder cannot be written.
     """
-    from PIL import Image
-
     settings = settings or SceneSettings()
     images, sparse = writable_folder(folder / "images"), writable_folder(folder / "sparse" / "0")
     world, cameras = furnish(settings.seed), photos(settings)
     with ThreadPoolExecutor(2) as pool:
         pictures = pool.map(lambda p: photograph(world, p, settings.supersample), cameras)
-        for done, (photo, picture) in enumerate(zip(cameras, pictures, strict=True), start=1):
+        for photo, picture in zip(cameras, pictures, strict=True):
             with replacing(images / photo.name) as path:
                 Image.fromarray(picture).save(path, quality=72, method=6)
-            if progress:
-                progress(done, len(cameras))
     points, colours = surface_points(world, cameras, settings.points, settings.seed)
     _write(sparse / "cameras.txt", _cameras_text(cameras[0]))
     _write(sparse / "images.txt", _images_text(cameras))
     _write(sparse / "points3D.txt", _points_text(points, colours))
-    return cameras
 
 
 def _write(path: Path, text: str) -> None:
@@ -218,7 +206,5 @@ def _points_text(points: NDArray[np.float64], colours: NDArray[np.uint8]) -> str
 
 def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     """Quaternion (4,) w, x, y, z of a rotation matrix (3, 3), with w >= 0."""
-    from scipy.spatial.transform import Rotation
-
     x, y, z, w = Rotation.from_matrix(rotation).as_quat(canonical=True)
     return np.array([w, x, y, z])

@@ -5,7 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import skimage
 from numpy.typing import NDArray
+from PIL import Image
 
 Texture = NDArray[np.float32]
 """(H, W, 3) linear RGB that wraps around."""
@@ -31,9 +33,6 @@ def photograph(name: str, size: int, rng: np.random.Generator) -> Texture:
 
     It reads the installed file and downloads nothing.
     """
-    import skimage
-    from PIL import Image
-
     path = Path(skimage.__file__).parent / "data" / name
     if not path.is_file():
         return noise(size, rng) * colour(0.8, 0.7, 0.6)
@@ -57,8 +56,9 @@ def noise(size: int, rng: np.random.Generator, contrast: float = 0.5) -> Texture
     return np.repeat((1 + total)[..., None], 3, axis=2)
 
 
-def planks(size: int, rng: np.random.Generator, count: int = 6) -> Texture:
-    """Wooden boards along the first axis, with wavy grain and dark joints, (size, size, 3)."""
+def planks(size: int, rng: np.random.Generator) -> Texture:
+    """Six wooden boards along the first axis, wavy grain and dark joints, (size, size, 3)."""
+    count = 6
     v, u = np.mgrid[0:size, 0:size].astype(np.float32) / size
     board = np.floor(u * count).astype(int)
     shade = rng.uniform(0.7, 1.15, count).astype(np.float32)[board]

@@ -21,8 +21,8 @@ from fragprune_plugins.learning.goals import Control, Portable, Pressure
 from fragprune_plugins.learning.schedule import Settings
 
 
-def few(iterations, train=None):
-    settings = Settings(iterations=iterations, train=train or "opacity", goal=Pressure(1e-2))
+def few(settings):
+    settings = replace(settings, goal=Pressure(1e-2))
     control = replace(settings, goal=Control())
     return Experiment(
         "rules",
@@ -59,7 +59,18 @@ def trained(monkeypatch):
 @pytest.fixture
 def words(tmp_path):
     data, model, _ = tiny.scene(tmp_path)
-    return ["rules", model, "--data", data, "--out", tmp_path / "out", "--iters", 3]
+    return [
+        "rules",
+        model,
+        "--data",
+        data,
+        "--out",
+        tmp_path / "out",
+        "--iters",
+        3,
+        "--train",
+        "opacity",
+    ]
 
 
 def test_writes_table_sheet_plot_and_configuration(words, trained, tmp_path):
@@ -143,9 +154,7 @@ def test_another_configuration_is_refused(words, trained, more, said):
 def test_a_changed_list_of_arms_is_refused(words, trained, monkeypatch):
     run_json(*words)
     monkeypatch.setitem(
-        catalogue.EXPERIMENTS,
-        "rules",
-        lambda *asked: replace(few(*asked), arms=few(*asked).arms[:2]),
+        catalogue.EXPERIMENTS, "rules", lambda asked: replace(few(asked), arms=few(asked).arms[:2])
     )
     result = run(*words)
     assert result.exit_code == 1
@@ -153,7 +162,7 @@ def test_a_changed_list_of_arms_is_refused(words, trained, monkeypatch):
     monkeypatch.setitem(
         catalogue.EXPERIMENTS,
         "rules",
-        lambda *asked: replace(few(*asked), arms=few(*asked).arms[::-1]),
+        lambda asked: replace(few(asked), arms=few(asked).arms[::-1]),
     )
     assert "the same arms in another order" in run(*words).stderr
 
@@ -195,7 +204,7 @@ def test_ctrl_c_keeps_finished_arms(words, trained, monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["moves", "x.ply", "--train", "all"], "none, because its arms differ"),
+        (["portable", "x.ply", "--train", "opacity"], "only shapes that move"),
         (["rules", "x.ply", "--iters", 3, "--scale", 2], "--iters with --scale"),
         (["rules", "x.ply", "--seeds", "a"], "not a list such as 0,1,2"),
         (["rulers", "x.ply"], "rulers"),
@@ -232,7 +241,7 @@ def test_an_arm_truncates_from_where_it_opens(words, trained, monkeypatch):
         *(Arm("learned", str(opens), learned, warmup=opens) for opens in (0, 3)),
     )
     experiment = Experiment("rules", "When?", arms, over="iterations")
-    monkeypatch.setitem(catalogue.EXPERIMENTS, "rules", lambda *asked: experiment)
+    monkeypatch.setitem(catalogue.EXPERIMENTS, "rules", lambda asked: experiment)
     _, control, early, never = run_json(*words)["rows"]
     for key in ("fragments_per_pixel", "psnr", "psnr_training"):
         assert never[key] == control[key]
@@ -242,12 +251,12 @@ def test_an_arm_truncates_from_where_it_opens(words, trained, monkeypatch):
 def test_prunes_before_training_and_scores_once(words, trained, monkeypatch):
     scored = []
 
-    def by_row(model, thresholds, views, engine):
+    def by_row(model, views, engine):
         scored.append(len(list(views)))
         return torch.arange(len(model))
 
-    def pruned(iterations, train=None):
-        control = replace(few(iterations).arms[0].settings)
+    def pruned(settings):
+        control = few(settings).arms[0].settings
         prunings = [Pruning("opacity", keep) for keep in (0.5, 0.1)]
         arms = [Arm("opacity", f"{each.keep:.0%}", control, pruning=each) for each in prunings]
         return Experiment("rules", "What wins?", (Arm("control", "", control), *arms))
@@ -265,8 +274,8 @@ def test_prunes_before_training_and_scores_once(words, trained, monkeypatch):
     assert "pruning" not in arms["control"]
 
 
-def changed(iterations, train=None):
-    settings = Settings(iterations=iterations, goal=Portable(1e-2))
+def changed(settings):
+    settings = replace(settings, train="all", goal=Portable(1e-2))
     control = replace(settings, goal=Control())
     arms = (
         Arm("control", "", control),
@@ -293,8 +302,8 @@ def test_other_defaults_of_the_pressure_are_another_configuration(words, trained
     """They are no settings, and a version under development has many of them."""
     from fragprune_plugins.learning import schedule
 
-    def default(iterations, train=None):
-        settings = Settings(iterations=iterations)
+    def default(settings):
+        settings = replace(settings, train="all")
         control = replace(settings, goal=Control())
         return Experiment("rules", "?", (Arm("control", "", control), Arm("learned", "", settings)))
 

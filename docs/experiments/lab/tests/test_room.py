@@ -98,13 +98,6 @@ def test_held_out_views_are_spread():
     assert max(heights) - min(heights) > 0.8
 
 
-def test_progress_counts_every_view(tmp_path):
-    told = []
-    tiny = replace(SMALL, views=3, width=16, height=12, supersample=1, points=10)
-    make_scene(tmp_path, tiny, lambda done, total: told.append((done, total)))
-    assert told == [(1, 3), (2, 3), (3, 3)]
-
-
 def test_textures_without_the_bundled_photographs(monkeypatch, tmp_path):
     """Where scikit-image's wheel lacks the files, noise takes their place."""
     import skimage

@@ -22,12 +22,14 @@ OPACITIES = st.lists(st.floats(1e-3, 0.999), min_size=1, max_size=20)
 @given(OPACITIES, st.floats(1e-3, 0.999))
 def test_a_falloff_threshold_is_the_same_for_all(opacities, tau):
     given = torch.tensor(opacities)
-    assert falloff_threshold(tau)(given).tolist() == pytest.approx([tau] * len(given), rel=1e-6)
+    assert falloff_threshold(tau).thresholds(given).tolist() == pytest.approx(
+        [tau] * len(given), rel=1e-6
+    )
 
 
 @given(OPACITIES, st.integers(1, 64), st.floats(0.0, 6.0))
 def test_an_alpha_cutoff_draws_what_is_as_opaque(opacities, levels, q):
-    thresholds = alpha_cutoff(levels)(torch.tensor(opacities)).tolist()
+    thresholds = alpha_cutoff(levels).thresholds(torch.tensor(opacities)).tolist()
     for opacity, threshold in zip(opacities, thresholds, strict=True):
         falloff = math.exp(-q / 2)
         alpha = opacity * falloff
@@ -48,7 +50,9 @@ def test_a_training_follows_a_rule_as_opacities_move(scene, rule):
     result = finetune_by(rule, model, dataset, settings)
     opacities = result.model.splats().opacities
     assert not torch.equal(opacities, model.splats().opacities)
-    torch.testing.assert_close(result.model.falloff, rule(opacities), atol=2e-7, rtol=1e-5)
+    torch.testing.assert_close(
+        result.model.falloff, rule.thresholds(opacities), atol=2e-7, rtol=1e-5
+    )
     assert result.progress.pressure == 0
     assert result.progress.speedup > 1.05
 
@@ -85,7 +89,7 @@ def test_a_rule_waits_as_long_as_learned_thresholds_do(scene, monkeypatch):
 
     def watched(opacities):
         drawn.append(len(opacities))
-        return falloff_threshold(0.2)(opacities)
+        return falloff_threshold(0.2).thresholds(opacities)
 
     finetune_by(Rule("watched", watched), model, dataset, Settings(iterations=5))
     assert len(drawn) == 2 + 1  # two steps that truncate, and the finished model

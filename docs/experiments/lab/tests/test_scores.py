@@ -13,12 +13,14 @@ from fragprune_plugins.engines import create_engine
 @pytest.fixture(scope="module", params=[False, True], ids=["whole", "truncated"])
 def expected(request):
     """Every score by brute force, and the scene."""
-    model, thresholds = scene(request.param)
+    model = scene(request.param)
     splats = model.splats()
     keys = ("total-weight", "largest-weight", "falloff-gradient", "hits")
     found = {key: [0.0] * COUNT for key in keys}
     mean = [[[0.0, 0, 0] for _ in VIEWS] for _ in range(COUNT)]  # weight, fragments, wins
-    for number, records, background, opacities in pixels(model, thresholds):
+    opacities, size = splats.opacities.double().tolist(), VIEWS[0].width * VIEWS[0].height
+    for pixel, (records, background) in enumerate(pixels(model)):
+        number = pixel // size
         pairs = [(r.alpha, r.color) for r in records]
         whole = colour(pairs, background)
         weights = [r.alpha * r.light for r in records]
@@ -42,25 +44,16 @@ def expected(request):
     volumes = splats.scales.double().prod(dim=1)
     hits = torch.tensor(found["hits"], dtype=torch.float64)
     found["light-gaussian"] = (splats.opacities.double() * hits * volumes**0.1).tolist()
-    found["opacity"] = splats.opacities.double().tolist()
-    return model, thresholds, found
+    found["opacity"] = opacities
+    return model, found
 
 
-EXACT = sorted(set(scores.SCORES) - {"removal-error", "removal-error-per-price"})
+EXACT = sorted(set(scores.SCORES) - {"removal-error"})
 
 
 @pytest.mark.parametrize("name", EXACT)
 def test_a_score_equals_that_of_loops_over_floats(expected, name):
-    model, thresholds, found = expected
-    got = scores.SCORES[name](model, thresholds, VIEWS, create_engine("auto"))
+    model, found = expected
+    got = scores.SCORES[name](model, VIEWS, create_engine("auto"))
     assert got.shape == (COUNT,)
     assert got.tolist() == pytest.approx(found[name], rel=1e-3, abs=1e-6)
-
-
-def test_a_price_is_what_is_drawn_and_a_constant(expected):
-    model, thresholds, found = expected
-    engine = create_engine("auto")
-    price = torch.tensor(found["hits"]) / len(VIEWS) + scores.GAUSSIAN_PRICE
-    error = scores.SCORES["removal-error"](model, thresholds, VIEWS, engine)
-    got = scores.SCORES["removal-error-per-price"](model, thresholds, VIEWS, engine)
-    torch.testing.assert_close(got, error / price)
