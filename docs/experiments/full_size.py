@@ -19,7 +19,6 @@ import sys
 import time
 from argparse import ArgumentParser
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -29,6 +28,7 @@ from fragprune_plugins.engines import Engine, create_engine
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.types import RasterInputs, View
+from fragprune_plugins.workbench.figures.evaluate import enlarged
 from fragprune_plugins.workbench.figures.metrics import psnr, ssim
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.scenes.dataset import Shot, load_photographs
@@ -102,7 +102,7 @@ def main() -> None:
         )
     views = [shot.view for shot in dataset.test]
     for size in args.sizes:
-        large = [replace(v, width=v.width * size, height=v.height * size) for v in views]
+        large = [enlarged(view, size) for view in views]
         taken = frames(engine, models, large, args.rounds)
         base = next(iter(taken.values()))
         ratios = (f"{n} {1e3 * s / len(views):.1f} ms, {base / s:.2f}x" for n, s in taken.items())

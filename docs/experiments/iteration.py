@@ -150,7 +150,7 @@ def profile(
     table = {}
     with tempfile.TemporaryDirectory() as folder:
         torch.manual_seed(0)
-        shots = photographs(Path(folder), gaussians, *sides(size))
+        shots = photographs(Path(folder), gaussians, *map(int, size.split("x")))
         data = Dataset(shots, shots)
         for kind in ("whole", "cut"):
             cut = kind == "cut"
@@ -177,7 +177,7 @@ def torch_loss(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
 
 def time_losses(size: str) -> dict[str, float]:
     """Value and gradient in ms of one thread's time, least of 9."""
-    width, height = sides(size)
+    width, height = map(int, size.split("x"))
     image, target = (torch.rand(3, height, width) for _ in range(2))
     image.requires_grad_()
     builds = {name: binding.open_build(name) for name in reversed(binding.usable_builds())}
@@ -194,12 +194,6 @@ def time_losses(size: str) -> dict[str, float]:
             rounds.append(1e3 * (time.process_time() - since))
         found[name] = min(rounds)
     return found
-
-
-def sides(size: str) -> tuple[int, int]:
-    """Width and height."""
-    width, height = map(int, size.split("x"))
-    return width, height
 
 
 def show(columns: dict[str, dict[str, float]]) -> None:

@@ -12,20 +12,20 @@ from __future__ import annotations
 
 import json
 import shutil
-import time
 from argparse import ArgumentParser, Namespace
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
+from full_size import frames
 from PIL import Image
 
+from fragprune_plugins.engines import create_engine
 from fragprune_plugins.learning.goals import Control, Pressure
 from fragprune_plugins.learning.pressure import ElasticPressure, PressureRule
 from fragprune_plugins.learning.schedule import Schedule, Settings
-from fragprune_plugins.plugins.hooks import engine_for
-from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
+from fragprune_plugins.workbench.figures.evaluate import Candidate, enlarged, measure_all
 from fragprune_plugins.workbench.finetune.api import finetune
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.scenes.dataset import Dataset, load_dataset
@@ -78,43 +78,26 @@ def compare(args: Namespace) -> None:
         "default": (usual, None),
     }
     arms |= {f"λ {p:g}": (replace(usual, goal=Pressure(p)), None) for p in args.pressure}
-    drawn, ended = [Candidate(splat)], ["as it came | - | -"]
+    drawn = {"as it came | - | -": splat}
     for label, (settings, schedule) in arms.items():
         result = finetune(splat, dataset, settings, schedule=schedule, progress=True)
         last = result.curves[-len(dataset.train) :]
         loss = sum(step.loss for step in last) / len(last)
-        ended.append(f"{label} | {loss:.4f} | {result.curves[-1].pressure:.1e}")
-        drawn.append(Candidate(result.model))
-    rows = measure_all(drawn, dataset.test, engine="cpu", repeats=1)
+        drawn[f"{label} | {loss:.4f} | {result.curves[-1].pressure:.1e}"] = result.model
+    rows = measure_all([*map(Candidate, drawn.values())], dataset.test, engine="cpu", repeats=1)
+    engine, taken = create_engine("cpu"), []
+    for larger in (1, 4):
+        views = [enlarged(shot.view, larger) for shot in dataset.test[:4]]
+        with torch.no_grad():
+            seconds = frames(engine, drawn, views, rounds=9).values()
+        taken.append([1e3 * each / len(views) for each in seconds])
     print("| arm | loss | λ | fragments | PSNR, dB | SSIM | frame, ms | frame at 4x, ms |")
     print("|---|---|---|---|---|---|---|---|")
-    times = zip(frames(drawn, dataset, 1), frames(drawn, dataset, 4), strict=True)
-    for label, row, (small, large) in zip(ended, rows, times, strict=True):
+    for label, row, small, large in zip(drawn, rows, *taken, strict=True):
         print(
             f"| {label} | {row['fragments_per_pixel']:.1f} | {row['psnr']:.2f} | "
             f"{row['ssim']:.4f} | {small:.2f} | {large:.2f} |"
         )
-
-
-@torch.no_grad()
-def frames(drawn: list[Candidate], dataset: Dataset, enlarge: int) -> list[float]:
-    """Least milliseconds of a frame of each candidate, mean over four held-out views."""
-    engine = engine_for("cpu", torch.device("cpu"))
-    views = [
-        replace(shot.view, width=enlarge * shot.view.width, height=enlarge * shot.view.height)
-        for shot in dataset.test[:4]
-    ]
-    least = np.full((len(drawn), len(views)), np.inf)
-    for turn in range(9):
-        for at, view in enumerate(views):
-            for index in range(len(drawn))[:: -1 if turn % 2 else 1]:
-                inputs = drawn[index].inputs(view)
-                thresholds = drawn[index].thresholds(inputs)
-                started = time.process_time()
-                engine.rasterize(inputs, thresholds)
-                spent = 1e3 * (time.process_time() - started)
-                least[index, at] = min(least[index, at], spent)
-    return [float(row.mean()) for row in least]
 
 
 if __name__ == "__main__":

@@ -64,7 +64,7 @@ def saving(path: Path, size: str) -> list[float]:
 def frame(path: Path, size: str) -> list[float]:
     """Draw a frame, five times."""
     engine, model = create_engine("cpu"), read_ply(path)
-    inputs = RasterInputs(make_view(*sides(size)), model.splats(), planes=())
+    inputs = RasterInputs(make_view(*map(int, size.split("x"))), model.splats(), planes=())
     with torch.no_grad():
         return [seconds(lambda: engine.rasterize(inputs, None)) for _ in range(5)]
 
@@ -72,7 +72,7 @@ def frame(path: Path, size: str) -> list[float]:
 def step(path: Path, size: str) -> list[float]:
     """Steps of ``finetune`` after the first."""
     keep_freed_memory()
-    view, model = make_view(*sides(size)), read_ply(path)
+    view, model = make_view(*map(int, size.split("x"))), read_ply(path)
     pixels = np.random.default_rng(0).integers(0, 256, (view.height, view.width, 3), dtype=np.uint8)
     photograph = path.with_suffix(".png")
     PIL.Image.fromarray(pixels).save(photograph)
@@ -102,12 +102,6 @@ def seconds(work: Callable[[], object]) -> float:
     since = time.perf_counter()
     work()
     return time.perf_counter() - since
-
-
-def sides(size: str) -> tuple[int, int]:
-    """Width and height."""
-    width, height = map(int, size.split("x"))
-    return width, height
 
 
 def measured(words: list[str]) -> tuple[list[float], float]:

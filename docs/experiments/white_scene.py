@@ -22,14 +22,14 @@ from plyfile import PlyData, PlyElement
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.ply import read_ply
-from fragprune_plugins.types import RasterInputs, View
+from fragprune_plugins.types import RasterInputs
+from fragprune_plugins.workbench.models.formats.arrays import SH_C0
+from fragprune_plugins.workbench.scenes.pinhole import Camera
 
 SIDE = 256
 SAMPLES = 3  # along each side of a pixel
 RING = 32
 POINTS = 5000
-SH_C0 = 0.28209479177387814
-NEAR, FAR = 0.01, 100.0
 
 
 def ring(poses: list[np.ndarray]) -> list[np.ndarray]:
@@ -53,16 +53,12 @@ def ring(poses: list[np.ndarray]) -> list[np.ndarray]:
 
 def picture(model: Model, pose: np.ndarray, tangent: float) -> PIL.Image.Image:
     """What a camera sees, 8 bits, before white."""
-    to_camera = np.linalg.inv(pose)
-    project = np.diag([1 / tangent, 1 / tangent, FAR / (FAR - NEAR), 0])
-    project[2, 3], project[3, 2] = -FAR * NEAR / (FAR - NEAR), 1
-    view, clip, centre = (
-        torch.tensor(each, dtype=torch.float32)
-        for each in (to_camera.T, (project @ to_camera).T, pose[:3, 3])
-    )
-    engine, size, drawn = create_engine("cpu"), SIDE * SAMPLES, []
+    to_camera, size = torch.from_numpy(np.linalg.inv(pose)), SIDE * SAMPLES
+    lens = (size / (2 * tangent), size / (2 * tangent), size / 2, size / 2)
+    camera = Camera(to_camera[:3, :3], to_camera[:3, 3], size, size, *lens)
+    engine, drawn = create_engine("cpu"), []
     for ground in (0.0, 1.0):
-        seen = View(size, size, tangent, tangent, view, clip, centre, torch.full((3,), ground))
+        seen = camera.view(torch.full((3,), ground))
         with torch.no_grad():
             image = engine.rasterize(RasterInputs(seen, model.splats(), planes=()), None).image
         pixels = image.reshape(3, SIDE, SAMPLES, SIDE, SAMPLES).mean((2, 4))

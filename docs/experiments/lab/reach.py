@@ -28,11 +28,9 @@ from fragprune_plugins.files.model import Model
 from fragprune_plugins.types import View
 from fragprune_plugins.workbench.bench.scene import make_scene, make_view
 from fragprune_plugins.workbench.bench.timing import describe_machine
-from fragprune_plugins.workbench.figures.viewing import overview
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.view.site import Layer, address, make_site, open_server
-
-SIZE = (1280, 720)
+from lab.bridges import SIZE, camera
 
 WAYS = {
     "truncated": (0, {"fixed": False, "stop": True}),
@@ -187,7 +185,7 @@ def main() -> None:
         action="append",
         default=[],
         metavar=("NAME", "UNPRUNED", "PRUNED", "CAMERA"),
-        help="two models, and `bench` (the bench scene's camera) or `overview` (from outside)",
+        help="CAMERA: `bench`, `overview`, or FILE:NUMBER of a cameras.json",
     )
     parser.add_argument("--cold", type=int, nargs="*", default=[150_000, 500_000], metavar="N")
     parser.add_argument("--rounds", type=int, default=7, help="of all in turns (7)")
@@ -197,13 +195,8 @@ def main() -> None:
     report["load"] = [os.getloadavg()[0]]
     with chromium() as browser:
         report["chromium"] = browser.version
-        for name, unpruned, pruned, camera in words.scene:
-            before, after = load(unpruned), load(pruned)
-            width, height = SIZE
-            if camera == "bench":
-                view = make_view(width, height)
-            else:
-                view = overview(before, width=width, height=height)
+        for name, unpruned, pruned, place in words.scene:
+            before, after, view = load(unpruned), load(pruned), camera(place, Path(unpruned))
             report["scenes"][name] = compare(browser, before, after, view, words.rounds)
         report["cold"] = [cold(browser, count, 3) for count in words.cold]
         with opened(browser, "data:text/html,") as tab:
