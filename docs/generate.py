@@ -174,7 +174,7 @@ PAGES: dict[str, Callable[[], str]] = {
 
 
 def _commands(group: click.Group, context: click.Context) -> Iterator[str]:
-    """The help of every command of a group, and of those below it."""
+    """The help of every command of a group."""
     for name in group.list_commands(context):
         command = group.get_command(context, name)
         assert command is not None
@@ -182,8 +182,6 @@ def _commands(group: click.Group, context: click.Context) -> Iterator[str]:
             command, parent=context, info_name=name, terminal_width=96, max_content_width=96
         )
         yield f"## {inner.command_path}\n\n```text\n{command.get_help(inner)}\n```"
-        if isinstance(command, click.Group):
-            yield from _commands(command, inner)
 
 
 def _page(title: str, intro: str, *parts: str) -> str:

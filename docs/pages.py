@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import subprocess
 import sys
 import tempfile
 import threading
@@ -20,10 +19,10 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
+from gallery import GALLERY, fragprune
 from PIL import Image
 from playwright.sync_api import sync_playwright
 
-GALLERY = Path(__file__).parent / "gallery"
 CHROMIUM = "/usr/bin/chromium"
 SCREENS = {
     "desktop": {"viewport": {"width": 1280, "height": 800}},
@@ -94,11 +93,6 @@ def served(folder: Path) -> Iterator[str]:
         thread.start()
         yield f"http://127.0.0.1:{server.server_port}"
         server.shutdown()
-
-
-def fragprune(*arguments: object) -> None:
-    """One command."""
-    subprocess.run([sys.executable, "-m", "fragprune_plugins", *map(str, arguments)], check=True)
 
 
 if __name__ == "__main__":

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from fragprune_plugins.errors import UsageError
 from fragprune_plugins.learning.interruption import sigterm_interrupts
 from fragprune_plugins.learning.schedule import FINETUNE_ITERATIONS, Settings
 from fragprune_plugins.workbench.commands.command import Command, Group, Report
@@ -18,13 +16,13 @@ from fragprune_plugins.workbench.commands.options import (
     FILE,
     MODEL,
     EngineOptions,
-    Function,
     Number,
     SceneOptions,
     bundled,
     engine_options,
     scene_options,
 )
+from fragprune_plugins.workbench.commands.rules import Alone
 from lab.catalogue import EXPERIMENTS, QUESTIONS
 
 if TYPE_CHECKING:
@@ -64,17 +62,6 @@ _out_option = click.option(
 )
 
 
-def _seeds_option(default: str) -> Callable[[Function], Function]:
-    return click.option(
-        "--seeds",
-        default=default,
-        show_default=True,
-        metavar="N,N,...",
-        callback=_seeds,
-        help="Train every arm once for each of these seeds.",
-    )
-
-
 _training_options = bundled(
     _as_given,
     click.argument("model", type=MODEL),
@@ -88,6 +75,7 @@ _training_options = bundled(
     click.option(
         "--scale",
         type=Number(min=0, min_open=True),
+        default=1.0,
         help="Multiply the default iterations by this instead.",
     ),
     click.option(
@@ -97,7 +85,14 @@ _training_options = bundled(
         show_default=True,
         help="Parameters that move in every arm.",
     ),
-    _seeds_option("0"),
+    click.option(
+        "--seeds",
+        default="0",
+        show_default=True,
+        metavar="N,N,...",
+        callback=_seeds,
+        help="Train every arm once for each of these seeds.",
+    ),
     engine_options(),
 )
 
@@ -118,15 +113,13 @@ def _train(
     scene: SceneOptions,
     out: Path,
     iters: int | None,
-    scale: float | None,
+    scale: float,
     train: Any,
     seeds: tuple[int, ...],
     engine: EngineOptions,
 ) -> Report:
     """Run an experiment that compares trainings."""
-    if iters is not None and scale is not None:
-        raise UsageError("options", "--iters with --scale", "one of the two", "Remove one.")
-    longest = iters or max(1, round(FINETUNE_ITERATIONS * (1.0 if scale is None else scale)))
+    longest = iters or max(1, round(FINETUNE_ITERATIONS * scale))
     experiment = EXPERIMENTS[name](Settings(iterations=longest, train=train))
 
     from lab import results, running
@@ -135,14 +128,7 @@ def _train(
     photographs = photographs_for(model, scene)
     with sigterm_interrupts():
         folder, outcomes = running.run(
-            experiment,
-            model,
-            photographs,
-            out,
-            engine=rasterizer,
-            device=where,
-            seeds=seeds,
-            progress=True,
+            experiment, model, photographs, out, engine=rasterizer, device=where, seeds=seeds
         )
     return _report(results.findings(experiment, outcomes, folder))
 
@@ -163,7 +149,11 @@ def _report(found: Findings) -> Report:
 for _name, _make in EXPERIMENTS.items():
     _asks = _make(Settings()).asks
     command.command(
-        _name, cls=Command, short_help=_asks, help=_TRAINING.format(asks=_asks, name=_name)
+        _name,
+        cls=Command,
+        rules=[Alone(("--iters", "--scale"))],
+        short_help=_asks,
+        help=_TRAINING.format(asks=_asks, name=_name),
     )(_training_options(partial(_train, _name)))
 
 
@@ -198,9 +188,7 @@ def _time_stages(
     drawer, where = open_engine(engine)
     photographs = photographs_for(models[0], scene)
     return _report(
-        stages.run(
-            models, photographs, out, engine=drawer, device=where, repeats=repeats, progress=True
-        )
+        stages.run(models, photographs, out, engine=drawer, device=where, repeats=repeats)
     )
 
 
@@ -222,6 +210,4 @@ def _count_fragments(
 
     drawer, where = open_engine(engine)
     photographs = photographs_for(models[0], scene)
-    return _report(
-        fragments.run(models, photographs, out, engine=drawer, device=where, progress=True)
-    )
+    return _report(fragments.run(models, photographs, out, engine=drawer, device=where))

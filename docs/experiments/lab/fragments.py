@@ -44,10 +44,9 @@ def run(
     out: Path,
     *,
     engine: Engine,
-    device: torch.device | str = "cpu",
-    progress: bool = False,
+    device: torch.device,
 ) -> Findings:
-    """Count what is missing of the experiment.
+    """Count what is missing of the experiment, with a bar on stderr.
 
     Args:
         paths: of the models, drawn with their thresholds; one alone is drawn without them too.
@@ -55,7 +54,6 @@ def run(
         out: the folder.
         engine: draws and counts; the oracle weighs fragments one by one.
         device: of the models and views.
-        progress: draw a bar on stderr.
 
     Raises:
         RecordError: the folder holds this experiment in another configuration, or a file of it
@@ -73,9 +71,7 @@ def run(
     folder = Folder(out, NAME, asked)
     parts = {}
     views = len(dataset.test)
-    with tqdm(
-        total=views * len(columns), disable=not progress, desc="fragments", unit="view"
-    ) as bar:
+    with tqdm(total=views * len(columns), desc="fragments", unit="view") as bar:
         for index, (label, column) in enumerate(columns.items()):
             bar.set_postfix_str(label)
             work = partial(_count, column, dataset.test, engine, bar)

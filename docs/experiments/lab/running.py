@@ -67,11 +67,10 @@ def run(
     out: Path,
     *,
     engine: Engine,
-    device: torch.device | str = "cpu",
-    seeds: Sequence[int] = (0,),
-    progress: bool = False,
+    device: torch.device,
+    seeds: Sequence[int],
 ) -> tuple[Folder, list[Outcome]]:
-    """Train and measure what is missing of an experiment.
+    """Train and measure what is missing of an experiment, with bars on stderr.
 
     Writes OUT/NAME.json, the configuration, and a file for each arm and seed into OUT/arms as soon
     as it is measured, so that an interrupted experiment goes on where it was (``Folder``).
@@ -84,7 +83,6 @@ def run(
         engine: draws everything.
         device: of the model and views.
         seeds: one training of every arm for each.
-        progress: draw bars on stderr.
 
     Returns:
         The folder with the configuration, and the outcomes in the order of arms and seeds.
@@ -101,12 +99,12 @@ def run(
     folder = Folder(out, experiment.name, asked)
     jobs = [(index, arm, seed) for index, arm in enumerate(experiment.arms) for seed in seeds]
     outcomes = []
-    scores = Scores(splat, dataset, engine, progress=progress)
-    with tqdm(jobs, disable=not progress, desc=experiment.name, unit="training") as bar:
+    scores = Scores(splat, dataset, engine)
+    with tqdm(jobs, desc=experiment.name, unit="training") as bar:
         for index, arm, seed in bar:
             label = f"{arm.label}, seed {seed}"
             bar.set_postfix_str(label)
-            work = partial(_outcome, arm, seed, splat, scores, dataset, engine, progress)
+            work = partial(_outcome, arm, seed, splat, scores, dataset, engine)
             content = folder.part(index, label, work)
             figures = (content[key] for key in ("before", "after", "train_seconds"))
             outcomes.append(Outcome(arm, seed, *figures))
@@ -120,11 +118,10 @@ class Scores:
         splat: N Gaussians, drawn without thresholds.
         dataset: its photographs.
         engine: draws the views.
-        progress: draw a bar on stderr.
     """
 
-    def __init__(self, splat: Model, dataset: Dataset, engine: Engine, *, progress: bool) -> None:
-        self._splat, self._engine, self._progress = splat, engine, progress
+    def __init__(self, splat: Model, dataset: Dataset, engine: Engine) -> None:
+        self._splat, self._engine = splat, engine
         self._views = [shot.view for shot in dataset.train]
         self._known: dict[str, torch.Tensor] = {}
 
@@ -132,20 +129,13 @@ class Scores:
         """The Gaussians that stay."""
         name = pruning.score
         if name not in self._known:
-            hidden = not self._progress
-            views = tqdm(self._views, disable=hidden, desc=name, unit="view", leave=None)
+            views = tqdm(self._views, desc=name, unit="view", leave=None)
             self._known[name] = SCORES[name](self._splat, views, self._engine)
         return self._splat.keep(best(self._known[name], pruning.keep))
 
 
 def _outcome(
-    arm: Arm,
-    seed: int,
-    splat: Model,
-    scores: Scores,
-    dataset: Dataset,
-    engine: Engine,
-    progress: bool,
+    arm: Arm, seed: int, splat: Model, scores: Scores, dataset: Dataset, engine: Engine
 ) -> dict[str, Any]:
     """What ``Outcome`` holds of an arm, as plain values."""
     settings = replace(arm.settings, seed=seed)
@@ -157,7 +147,7 @@ def _outcome(
         settings,
         schedule=_schedule(arm, settings),
         engine=engine,
-        progress=progress,
+        progress=True,
     )
     if result.interrupted:
         raise (Terminated if result.terminated else Interrupted)(

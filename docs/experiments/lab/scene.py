@@ -21,7 +21,7 @@ from fragprune_plugins.workbench.scenes.dataset import Dataset
 
 
 def load_columns(
-    paths: Sequence[Path], device: torch.device | str = "cpu"
+    paths: Sequence[Path], device: torch.device
 ) -> tuple[dict[str, Candidate], dict[str, Any]]:
     """The columns of a table, by label, and what they are, as plain values.
 
@@ -63,7 +63,7 @@ def describe_photographs(photographs: Photographs, dataset: Dataset) -> dict[str
     }
 
 
-def describe_drawing(engine: Engine, device: torch.device | str) -> dict[str, Any]:
+def describe_drawing(engine: Engine, device: torch.device) -> dict[str, Any]:
     """What draws, and on what, as plain values."""
     return {
         "engine": engine.name,

@@ -31,7 +31,6 @@ NAME = "stages"
 SIZES = (256, 512, 1024, 2048, 3840)
 """Pixels of the longer side."""
 
-REPEATS = 15
 _FULL = 2048  # pixels; half as large pictures are drawn in twice as many rounds
 _VIEWS = 3
 _REST = "rest"  # of a frame, outside of the engine's stages
@@ -44,12 +43,10 @@ def run(
     out: Path,
     *,
     engine: Engine,
-    device: torch.device | str = "cpu",
-    sizes: Sequence[int] | None = None,
-    repeats: int = REPEATS,
-    progress: bool = False,
+    device: torch.device,
+    repeats: int,
 ) -> Findings:
-    """Time what is missing of the experiment.
+    """Time what is missing of the experiment, with a bar on stderr.
 
     Args:
         paths: of the models, drawn with their thresholds; one alone is drawn without them too.
@@ -57,16 +54,13 @@ def run(
         out: the folder.
         engine: draws; one that keeps no time of its stages shows whole frames alone.
         device: of the models and views.
-        sizes: pixels of the pictures' longer side; ``SIZES`` when None.
         repeats: rounds for the largest pictures, more for small ones; in each, every view is drawn
             by every model in turns.
-        progress: draw a bar on stderr.
 
     Raises:
         RecordError: the folder holds this experiment in another configuration, or a file of it
             cannot be read.
     """
-    sizes = SIZES if sizes is None else sizes
     columns, said = load_columns(paths, device)
     dataset = load_photographs(photographs).to(device)
     views = [shot.view for shot in evenly_spaced(dataset.test, _VIEWS)]
@@ -75,13 +69,13 @@ def run(
         "models": said,
         "photographs": describe_photographs(photographs, dataset),
         "views": len(views),
-        "sizes": list(sizes),
+        "sizes": list(SIZES),
         "repeats": repeats,
         **describe_drawing(engine, device),
     }
     folder = Folder(out, NAME, asked)
     rows = []
-    with tqdm(sizes, disable=not progress, desc="stages", unit="size") as bar:
+    with tqdm(SIZES, desc="stages", unit="size") as bar:
         for index, size in enumerate(bar):
             bar.set_postfix_str(f"{size} pixels")
             rounds = repeats * max(1, _FULL // size)
