@@ -14,6 +14,7 @@ from browser.viewing import write_page
 from cli.commands import run_json
 from finetune import tiny
 
+from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.demo import work as demo_page
 
 pytestmark = [
@@ -53,7 +54,7 @@ def ours(tmp_path_factory):
     record = json.loads(pruned.with_suffix(".fragprune.json").read_text())["data"]
     report = {**figures, "model_before": model, "model_after": pruned}
     report["control"] = figures["before"]
-    demo_page.write_page(root / "demo", report, data, record["curves"], "cpu", "cpu")
+    demo_page.write_page(root / "demo", report, data, record["curves"], EngineOptions("cpu", "cpu"))
     return root
 
 

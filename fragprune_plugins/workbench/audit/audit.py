@@ -36,9 +36,6 @@ from fragprune_plugins.workbench.scenes.generated import Named
 HALF_LEVEL = 0.5 / 255
 """What an 8-bit picture does not show."""
 
-VIEWS = 12
-"""Cameras that are generated, and most that are drawn of given ones."""
-
 TILES = 384
 """Tiles of 16x16 pixels, of all views together, whose fragments are weighed."""
 

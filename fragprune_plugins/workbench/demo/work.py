@@ -7,7 +7,7 @@ import json
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -63,8 +63,7 @@ class DemoSettings:
     iterations: int = 1000
     finetune: int = 500  # iterations of stage 2
     seed: int = 0
-    engine: str = "auto"
-    device: str = "cpu"
+    engine: EngineOptions = field(default_factory=partial(EngineOptions, device="cpu"))
     views: int = VIEWS
     width: int = WIDTH
     points: int = POINTS
@@ -73,9 +72,8 @@ class DemoSettings:
 def demo(*, out: Path, iters: int, seed: int, engine: EngineOptions) -> Report:
     """Do what ``fragprune demo`` promises; its options are the arguments."""
     _, where = open_engine(engine)
-    settings = DemoSettings(
-        iterations=iters, finetune=iters // 2, seed=seed, engine=engine.name, device=str(where)
-    )
+    drawing = replace(engine, device=str(where))
+    settings = DemoSettings(iterations=iters, finetune=iters // 2, seed=seed, engine=drawing)
     report = run_demo(out, settings, partial(click.echo, err=True))
     larger = report["larger"]
     table = wording.describe(wording.columns_of(report))
@@ -133,7 +131,7 @@ def run_demo(
         make_scene(scene, views=settings.views, width=settings.width, points=settings.points)
     command = host_command(scene.resolve(), model.resolve(), settings)
     learning = Settings(iterations=settings.finetune, seed=settings.seed)
-    at = EngineOptions(settings.engine, settings.device)
+    at = settings.engine
     looking = Looking(at)
     options = RunOptions(settings=learning, engine=at.name, device=at.device, look=looking)
     with claiming(out, "model"), contextlib.redirect_stdout(sys.stderr):
@@ -149,18 +147,16 @@ def run_demo(
     paths = [path for path in saved if path is not None]  # all: the host saves at its last step
     say("3/4  Measuring on the held-out views")
     before, after, control = measure_all(
-        [Candidate(models.load(path, device=settings.device)) for path in paths],
+        [Candidate(models.load(path, device=at.device)) for path in paths],
         load_dataset(scene).test,
-        engine=settings.engine,
+        engine=at.name,
         repeats=_REPEATS,
     )
     report = figures_of(summary, learning, looking, before, after)
     report |= {"control": control, "engine": after["engine"], "device": after["device"]}
     say("4/4  Drawing the pictures")
     with claiming(out, "pictures", "index.html", "model"):
-        report["files"] = write_page(
-            out, report, scene, summary.curves, settings.engine, settings.device
-        )
+        report["files"] = write_page(out, report, scene, summary.curves, at)
         pair = tuple(paths[:2])
         read = records.Recorded(Photographs(scene), pair, filtered=True, drawing=summary.drawing)
         more = {"curves": summary.curves, "photographs": read.as_dict()}
@@ -176,19 +172,19 @@ def write_page(
     report: dict[str, Any],
     scene: Path,
     curves: list[dict[str, float]],
-    engine: str,
-    device: str,
+    engine: EngineOptions,
 ) -> list[str]:
     """Write ``pictures/`` and ``index.html``; returns their files, relative to ``out``.
 
     Adds "larger" to the report: frame times of pictures as large as the page's.
     """
     pictures = out / "pictures"
-    one, other = (models.load(report[f"model_{k}"], device=device) for k in ("before", "after"))
+    saved = (report[f"model_{key}"] for key in ("before", "after"))
+    one, other = (models.load(path, device=engine.device) for path in saved)
     original, pruned = Candidate(one.untruncated()), Candidate(other)
     shots = sorted(load_dataset(scene).test, key=lambda shot: shot.name != _FIRST)
-    rasterizer = engine_for(engine, device)
-    views = [enlarged(shot.view, LARGER).to(device) for shot in shots]
+    rasterizer = engine_for(engine.name, engine.device)
+    views = [enlarged(shot.view, LARGER).to(engine.device) for shot in shots]
     times = frame_times([original, pruned], views, rasterizer, repeats=_REPEATS)
     size = f"{views[0].width}x{views[0].height}"
     report["larger"] = {"size": size, "before": times[0], "after": times[1]}

@@ -80,7 +80,7 @@ def _size(model: Path) -> int:
 
 
 def _images_file(model: Path) -> Path:
-    """A model's list of images: binary first, as hosts have it; text is an export."""
+    """A model's list of images. Binary first, as hosts do: COLMAP writes it; text is an export."""
     binary = model / "images.bin"
     return binary if binary.exists() else model / "images.txt"
 
@@ -89,13 +89,9 @@ def read(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]
     """Read training and held-out views of a folder in which ``find_model`` finds something."""
     model = find_model(folder)
     assert model is not None
-    # Binary first, as hosts do: COLMAP writes binary files, and text files are an export.
-    if (model / "images.bin").exists():
-        found = model / "cameras.bin", model / "images.bin"
-        parsers = _cameras_binary, _images_binary
-    else:
-        found = model / "cameras.txt", model / "images.txt"
-        parsers = _cameras_text, _images_text
+    listed = _images_file(model)
+    binary = listed.suffix == ".bin"
+    parsers = (_cameras_binary, _images_binary) if binary else (_cameras_text, _images_text)
     larger = (each for each in others(folder) if _size(each) > _size(model))
     if model == folder / "sparse" / "0" and (other := max(larger, key=_size, default=None)):
         log.warning(
@@ -103,12 +99,12 @@ def read(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]
             "photographs are not in the figures. If the model was trained on them, exchange both",
             *(printable(str(folder)), printable(str(other))),
         )
-    with _FILE.reading(found[0]) as reading:
+    with _FILE.reading(listed.with_stem("cameras")) as reading:
         cameras = dict(parsers[0](reading))
     rows = []
-    with _FILE.reading(found[1]) as reading:
-        for listed, camera_id, quaternion, translation in parsers[1](reading):
-            name = listed.replace("\\", "/")  # of a model made on Windows
+    with _FILE.reading(listed) as reading:
+        for given, camera_id, quaternion, translation in parsers[1](reading):
+            name = given.replace("\\", "/")  # of a model made on Windows
             if camera_id not in cameras:
                 raise DatasetError(
                     str(model),
