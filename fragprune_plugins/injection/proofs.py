@@ -23,7 +23,7 @@ from fragprune_plugins.errors import EngineError, InputError, ProofError, log
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.hosts.dialect import HostCall, Place, Proof, Prover
 from fragprune_plugins.hosts.seams import SeamCall
-from fragprune_plugins.hosts.source import parsed
+from fragprune_plugins.hosts.source import nodes, parsed
 
 if TYPE_CHECKING:
     from fragprune_plugins.injection.state import SessionState
@@ -114,7 +114,7 @@ def _place(session: SessionState) -> Place:
 @cache
 def _read_place(file: Path, line: int, at: str) -> Place:
     around: dict[type, Any] = {}  # the innermost of each kind, because it is walked to last
-    for node in ast.walk(parsed(file.read_text(errors="replace")) or ast.Module([], [])):
+    for node in nodes(parsed(file.read_text(errors="replace"))):
         if getattr(node, "lineno", line + 1) <= line <= (getattr(node, "end_lineno", 0) or 0):
             around[type(node)] = node
     assigned, function = around.get(ast.Assign), around.get(ast.FunctionDef)
@@ -122,8 +122,8 @@ def _read_place(file: Path, line: int, at: str) -> Place:
     if function is None or not isinstance(target, ast.Tuple):
         return Place(at)
     names = tuple(ast.unparse(each) for each in target.elts)
-    nodes = (node for node in ast.walk(function) if isinstance(node, ast.Name))
-    read = {node.id for node in nodes if isinstance(node.ctx, ast.Load)}
+    used = (node for node in nodes(function) if isinstance(node, ast.Name))
+    read = {node.id for node in used if isinstance(node.ctx, ast.Load)}
     unread = {k for k, name in enumerate(names) if name.isidentifier() and name not in read}
     return Place(at, names, frozenset(unread))
 
