@@ -12,7 +12,6 @@ from finetune import tiny
 import fragprune_plugins as fp
 from fragprune_plugins import RasterInputs, Schedule, Settings
 from fragprune_plugins.learning.pressure import OWN_PRESSURE
-from fragprune_plugins.workbench.figures.metrics import psnr
 
 
 @pytest.fixture
@@ -38,29 +37,6 @@ def test_no_photograph_is_opened(data, path, out):
     assert 25 < report["after"]["psnr"] < 80
     assert report["after"]["fragments_per_pixel"] < report["before"]["fragments_per_pixel"]
     assert fp.load(out).falloff is not None
-
-
-def test_the_figure_is_the_difference_to_the_model_s_own_pictures(path, model, cameras, out):
-    report = finetuned(path, out, "--cameras", cameras, "--pressure", 1e-3)
-    learned = fp.load(out)
-    held_out = fp.load_cameras(cameras)[::8]
-    with torch.no_grad():
-        values = [
-            psnr(
-                fp.rasterize(RasterInputs(view, learned.splats()), learned.thresholds).image,
-                fp.rasterize(RasterInputs(view, model.splats())).image,
-            )
-            for _, view in held_out
-        ]
-    assert report["after"]["views"] == len(values) == 3
-    assert report["after"]["psnr"] == pytest.approx(sum(values) / 3, abs=1e-3)
-
-
-def test_needs_nothing_but_the_model_and_gives_the_same_again(path, out):
-    words = (path, out, "--resolution", 16, "--iters", 3, "--threads", 1)
-    one, two = finetuned(*words)["after"], finetuned(*words, "--again")["after"]
-    assert one["views"] == 12
-    assert [one[key] == two[key] for key in ("psnr", "fragments_per_pixel")] == [True, True]
 
 
 def test_without_options_the_cameras_are_those_of_its_training(path, cameras, out, tmp_path):

@@ -261,21 +261,6 @@ def test_figures_of_a_model_with_exposures_say_that_they_are_left_out(output):
     assert not run_json("profile", output, "--self")["warnings"]
 
 
-def test_a_model_is_drawn_as_the_record_of_its_run_says(output, data, tmp_path, caplog):
-    model = newest_model(output)
-    words, pictures = ("render", model, "--data", data, "--out", tmp_path / "p"), []
-    for drawing in ({}, {"compensation": "antialiasing"}):
-        said = records.Recorded(Photographs(data), (model,), drawing=drawing).as_dict()
-        records.leave(model, "run", {"photographs": said})
-        succeeds(*words)
-        pictures.append(np.asarray(Image.open(next((tmp_path / "p").glob("*.png"))), int))
-        psnr = run_json("profile", model, "--data", data)["psnr"]
-        assert psnr == run_json("compare", model, model, "--data", data)["a"]["psnr"]
-    assert np.abs(pictures[0] - pictures[1]).max() > 2
-    run("view", model, "--out", tmp_path / "view.html")
-    assert "trained with antialiasing, and is drawn here as 3DGS draws" in caplog.text
-
-
 def test_a_model_is_drawn_by_a_record_that_was_copied_before_it(
     output, data, tmp_path, monkeypatch
 ):
