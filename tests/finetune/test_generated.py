@@ -22,7 +22,6 @@ from fragprune_plugins.workbench.scenes.generated import (
     interpolate,
     own_pictures,
 )
-from fragprune_plugins.workbench.scenes.posed import hold_out
 
 NUMBER = st.floats(-3, 3, width=32)
 PLACE = st.tuples(NUMBER, NUMBER, NUMBER)
@@ -166,12 +165,6 @@ def test_a_splat_fills_its_pictures_whatever_its_unit(scale):
         for _, view in cameras:
             outputs = rasterize(small, view)
             assert (outputs.radii > 0).float().mean() > 0.8
-
-
-def test_one_in_eight_is_held_out():
-    learned, held = hold_out(list(range(20)))
-    assert held == [0, 8, 16]
-    assert sorted(learned + held) == list(range(20))
 
 
 def test_one_camera_is_too_few():

@@ -1,8 +1,6 @@
 """A fine-tuning that was cut off goes on, and ends with the same bits as one that was not."""
 
 import json
-import os
-import signal
 
 import pytest
 import torch
@@ -13,7 +11,6 @@ from safetensors.torch import save_file
 from fragprune_plugins.errors import CheckpointError, DivergedError, OutputError
 from fragprune_plugins.learning import schedule
 from fragprune_plugins.learning.goals import Control, Fewer, Portable, Pressure
-from fragprune_plugins.learning.interruption import sigterm_interrupts
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.workbench.finetune import loop, resuming
 from fragprune_plugins.workbench.finetune.api import finetune
@@ -111,24 +108,6 @@ def test_dropped_alpha_is_noticed_where_there_is_some(tmp_path, mode):
         for opaque in (True, False)
     )
     assert (one != other) == (mode == "RGBA")
-
-
-@pytest.mark.usefixtures("ctrl_c")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_waits_for_the_end_of_its_step_and_is_resumed_from_there(
-    model, dataset, tmp_path, monkeypatch, number
-):
-    settings, path = Settings(iterations=STEPS), tmp_path / "out.fragprune-unfinished"
-    whole = run(model, dataset, settings)
-    with monkeypatch.context() as patch, sigterm_interrupts():
-        tiny.at_loss(patch, 5, lambda: os.kill(os.getpid(), number))
-        cut = run(model, dataset, settings, path)
-    assert cut.interrupted
-    assert cut.terminated == (number == signal.SIGTERM)
-    assert cut.progress.steps == 5
-    result = run(model, dataset, settings, path)
-    assert result.resumed_at == 5
-    require_same(whole, result)
 
 
 @pytest.fixture(scope="module")
