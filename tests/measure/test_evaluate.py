@@ -52,13 +52,6 @@ def test_truncation_draws_less(truth, shots):
     assert plain["frame_ms_se"] == 0.0
 
 
-def test_a_model_is_measured_as_its_host_draws_it(truth, shots):
-    candidates = [Candidate(truth), Candidate(truth, {"dilation": 2.0})]
-    plain, wide = measure_all(candidates, shots)
-    assert wide["fragments_per_pixel"] > plain["fragments_per_pixel"]
-    assert wide["psnr"] < plain["psnr"]
-
-
 def test_nothing_to_measure_learn_or_judge_by_is_stated(truth, shots):
     for views, repeats in (([], 1), (shots, 0)):
         with pytest.raises(InputError, match="at least one of each"):
