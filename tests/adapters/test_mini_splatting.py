@@ -10,11 +10,11 @@ import torch
 from miniatures import runs
 from miniatures.mini_splatting import MiniSplattingHost
 from miniatures.runs import OFF, OPTIONS, miniature
-from miniatures.vanilla_3dgs import HOST, InterruptAt, joint, label, running
+from miniatures.vanilla_3dgs import HOST, joint, label, running
 
 from fragprune_mini_splatting import MiniSplatting
 from fragprune_plugins.adapting import HostRepo
-from fragprune_plugins.errors import AlignmentError, Interrupted, SeamError, UnknownHostError
+from fragprune_plugins.errors import AlignmentError, SeamError, UnknownHostError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.hosts.choosing import choose, locate
 from fragprune_plugins.injection.launch import run
@@ -79,15 +79,6 @@ def test_the_metric_without_its_weights_is_said_once(mini, photographs, tmp_path
     said = [record for record in caplog.records if "lpipsPyTorch:lpips" in record.getMessage()]
     assert len(said) == 1
     assert "no way there" in said[0].getMessage()
-
-
-@pytest.mark.usefixtures("ctrl_c")
-def test_an_interrupted_run_saves_at_its_own_iteration(mini, photographs, tmp_path, plug):
-    plug(InterruptAt(3))
-    with pytest.raises(Interrupted):
-        run(command(mini, photographs, tmp_path, 16), OPTIONS)
-    (saved,) = tmp_path.glob("point_cloud/*/*.safetensors")
-    assert saved.parent.name == "iteration_19"  # 16 and 3 steps; the host's own clock is at 5009
 
 
 def test_another_package_of_the_hosts_name_is_refused(mini, photographs, tmp_path, monkeypatch):

@@ -7,7 +7,6 @@ import torch
 from miniatures.vanilla_3dgs import joint
 
 from fragprune_plugins import Control, Pressure, Settings, ThresholdStore
-from fragprune_plugins.errors import OutputError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.workbench.models.formats.ply import write_ply
@@ -74,24 +73,3 @@ def test_a_host_loads_the_thresholds_of_a_file_with_a_column(tmp_path):
         model = host.model(5)
         model.load_ply(str(path))
         assert torch.equal(host.store(model).values, values)
-
-
-def test_a_save_that_is_cut_off_leaves_the_pair_before(tmp_path, monkeypatch):
-    path, written = tmp_path / "point_cloud.ply", []
-
-    def cut_off(whole, *_):
-        written.extend(each.name for each in whole.parent.iterdir())
-        raise OSError(28, "No space left on device")
-
-    with joint() as host:
-        model = trained(host)
-        model.save_ply(str(path))
-        before = path.read_bytes()
-        host.step(model, host.camera(), 4)
-        monkeypatch.setattr(sidecar, "_write", cut_off)
-        with pytest.raises(OutputError, match="No space left"):
-            model.save_ply(str(path))
-    assert written == [path.name]  # the host had written its file
-    assert path.read_bytes() == before
-    assert sidecar.belongs(path)
-    assert len(list(tmp_path.iterdir())) == 2
