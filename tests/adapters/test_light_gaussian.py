@@ -194,8 +194,6 @@ def test_distillation_is_resumed_by_the_training_script(mini, photographs, train
 
 
 class Teachers:
-    """Keeps every store that is attached."""
-
     def __init__(self):
         self.stores = []
 
