@@ -48,7 +48,6 @@ def main() -> int:
 
 
 def row(name: str, tally: Tally) -> str:
-    """A line of the table."""
     kinds = ("read", "stated", *BAD)
     return f"{name:<36}{tally.inputs:>9}" + "".join(f"{tally.outcomes[kind]:>9}" for kind in kinds)
 

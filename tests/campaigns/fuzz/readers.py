@@ -212,7 +212,6 @@ class Reader:
     read: Callable[[Path], None]
 
     def pool(self) -> list[bytes]:
-        """The kept inputs."""
         return [path.read_bytes() for path in sorted((seeds.CORPUS / self.name).iterdir())]
 
 
