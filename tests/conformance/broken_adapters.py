@@ -34,8 +34,6 @@ class PatchesByHand(Vanilla3DGS):
 
 
 class TakesRandomNumbers(Vanilla3DGS):
-    """Moves the host's random stream."""
-
     def means(self, model: Any) -> torch.Tensor:
         torch.rand(1)
         return super().means(model)
@@ -91,14 +89,10 @@ class LeavesItsRates(Vanilla3DGS):
 
 
 class LetsItGrow(Vanilla3DGS):
-    """Holds back no densification in stage 2."""
-
     seams = revised(Vanilla3DGS.seams, {"GaussianModel.densify_and_prune": None})
 
 
 class LetsItReset(Vanilla3DGS):
-    """Holds back no reset of opacities in stage 2."""
-
     seams = revised(Vanilla3DGS.seams, {"GaussianModel.reset_opacity": None})
 
 
@@ -133,8 +127,6 @@ class ReadsNoSource(Vanilla3DGS):
 
 
 class FitsEverything(Vanilla3DGS):
-    """Takes any folder for its host."""
-
     def match(self, repo: Any) -> Match:
         return Match(self.name, True)
 
@@ -184,15 +176,11 @@ class ForgetsTheBackground(Vanilla3DGS):
 
 @dataclass(frozen=True)
 class Radiusless(GraphdecoDialect):
-    """Gives radii of 0."""
-
     def pack(self, outputs: Any, call: Any) -> Any:
         return super().pack(replace(outputs, radii=torch.zeros_like(outputs.radii)), call)
 
 
 class GivesNoRadii(Vanilla3DGS):
-    """Gives radii of 0."""
-
     def dialect(self, repo: Any) -> Radiusless:
         return Radiusless(**vars(super().dialect(repo)))
 
