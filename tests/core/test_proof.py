@@ -218,7 +218,6 @@ def test_an_output_that_was_found_is_made_with_thresholds(host, difference):
 
 
 def scaled(session, model):
-    """Draw a model whose scales are multiplied."""
     draw = import_module("gaussian_renderer").render
     draw(session.camera(96, 64), model, session.driver.pipe(), torch.zeros(3), 1.5)
 
