@@ -196,7 +196,6 @@ def test_colours_without_sh_are_named_with_who_writes_them(tmp_path):
 
 
 def without(*names):
-    """Leave out columns."""
     return lambda path: write_columns(
         path, {name: each for name, each in columns(path).items() if name not in names}
     )
