@@ -112,7 +112,6 @@ def run_broken(device: EmulatedDevice, kernel: str) -> None:
 
 
 def main() -> None:
-    """The command."""
     parser = argparse.ArgumentParser(prog="python -m gpu.sanitized", description=__doc__)
     parser.add_argument("kind", choices=SANITIZERS)
     parser.add_argument("--resident", type=int, default=3, help="blocks under way at a time")

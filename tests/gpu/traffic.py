@@ -57,7 +57,6 @@ class CountingDevice(EmulatedDevice):
 
 
 def row(traffic: np.ndarray[Any, Any]) -> dict[str, float]:
-    """Figures of a kernel."""
     requests, lanes, units, least = traffic.T
     return {
         "sectors, once a block": least[:3].sum(),
@@ -69,7 +68,6 @@ def row(traffic: np.ndarray[Any, Any]) -> dict[str, float]:
 
 
 def main() -> None:
-    """The command."""
     parser = argparse.ArgumentParser(prog="python -m gpu.traffic", description=__doc__)
     parser.add_argument("--gaussians", type=int, default=100_000)
     parser.add_argument("--size", default="640x480")
