@@ -26,8 +26,6 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 
 class Recorder:
-    """Observes everything."""
-
     def __init__(self):
         self.events = []
 
