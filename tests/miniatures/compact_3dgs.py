@@ -103,8 +103,6 @@ class ResidualVQ(nn.Module):
 
 
 class Added:
-    """Methods of GaussianModel that vanilla does not have, or has otherwise."""
-
     def __init__(self, model):
         self.vanilla_init(0)
         self._mask = torch.empty(0)

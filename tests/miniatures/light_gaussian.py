@@ -17,8 +17,6 @@ args = SimpleNamespace()  # the host's scripts hold their options under this nam
 
 
 class Added:
-    """Methods of GaussianModel that vanilla does not have."""
-
     def onedownSHdegree(self):  # noqa: N802 - the name callers use
         if self.active_sh_degree > self.max_sh_degree:
             self.active_sh_degree -= 1

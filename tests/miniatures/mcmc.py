@@ -32,8 +32,6 @@ def compute_relocation_cuda(opacity_old, scale_old, N):
 
 
 class Added:
-    """Methods of GaussianModel that vanilla does not have, or has otherwise."""
-
     def replace_tensors_to_optimizer(self, inds=None):
         def emptied(moment):
             moment[slice(None) if inds is None else inds] = 0

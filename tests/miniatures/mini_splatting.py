@@ -26,8 +26,6 @@ args = SimpleNamespace()  # the host's scripts hold their options under this nam
 
 
 class Added:
-    """Methods of GaussianModel that vanilla does not have."""
-
     def densify_and_prune_split(self, max_grad, min_opacity, extent, max_screen_size, mask):
         grads = (self.xyz_gradient_accum / self.denom).nan_to_num(0.0)
         self.densify_and_clone(grads, max_grad, extent)

@@ -15,8 +15,6 @@ from miniatures.family import MODEL, RENDERER, STEP, TRAIN, Derived, adding
 
 
 class Added:
-    """Methods of GaussianModel that vanilla does not have, or has otherwise."""
-
     @property
     def get_scaling_with_3D_filter(self):  # noqa: N802 - the name callers use
         return torch.sqrt(self.get_scaling.square() + self.filter_3D.square())

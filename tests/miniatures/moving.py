@@ -15,8 +15,6 @@ from miniatures.family import MODEL, RADII, RENDERER, SCENE, TRAIN, Derived, Gro
 
 
 class Added:
-    """Methods of GaussianModel that vanilla does not have, or has otherwise."""
-
     def __init__(self, sh_degree, args):
         self.vanilla_init(sh_degree)
         self._deformation = deform_network(args)  # noqa: F821 - imported where this is put

@@ -17,8 +17,6 @@ MODES = ("ours", "ours_new", "paper_random", "c2f", "white_bg")
 
 
 class Added:
-    """Methods of GaussianModel that vanilla does not have, or has otherwise."""
-
     def densify_and_split(self, grads, grad_threshold, scene_extent, N=2, abe_split=False):
         if abe_split:
             chosen = self._needy(grads, grad_threshold, scene_extent, large=True)

@@ -33,8 +33,6 @@ OMEGA = "from omegaconf import OmegaConf\nfrom omegaconf.dictconfig import DictC
 
 
 class Added:
-    """Methods of GaussianModel that vanilla does not have, or has otherwise."""
-
     def __init__(
         self,
         sh_degree,
