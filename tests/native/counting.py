@@ -19,12 +19,8 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from fragprune_plugins.engines.cpu import binding
-
-if TYPE_CHECKING:
-    pass
 
 STAGES = {
     "project": "fp::project_all(",
@@ -145,7 +141,6 @@ def scene(size, gaussians, falloff=0.0, planes=(), scale=1.5):
 
 
 def main() -> None:
-    """Count and print."""
     import torch
 
     from fragprune_plugins.files.ply import read_ply

@@ -300,7 +300,6 @@ def placed(scene, pixels, depths, sigma):
 
 
 def uniform(seed: int, low: float, high: float, *shape: int) -> torch.Tensor:
-    """Numbers in float64."""
     generator = torch.Generator().manual_seed(seed)
     return torch.rand(*shape, generator=generator, dtype=torch.float64) * (high - low) + low
 
