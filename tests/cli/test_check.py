@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import pytest
 from cli.commands import fails, run, run_json, succeeds
 from core.test_verdict import fork as fork  # a fixture
+from miniatures.runs import edit
 from miniatures.skeletons import skeleton
 
 from fragprune_plugins.adapting import HostRepo, Role, Seam
@@ -85,10 +86,8 @@ OTHERWISE = {
 
 @pytest.mark.parametrize("what", OTHERWISE)
 def test_a_script_with_other_steps_is_not_vanillas(host, what):
-    script = host / "train.py"
     old, new, found = OTHERWISE[what]
-    assert old in script.read_text()
-    script.write_text(script.read_text().replace(old, new))
+    edit(host / "train.py", old, new)
     report = refused(host)
     assert report["verdict"] == "finetune"
     learns = "--self" if what == "is no Python" else "--data SCENE"  # its loss cannot be read

@@ -8,7 +8,7 @@ import pytest
 import torch
 from cli.commands import fails, run, run_error, run_json, succeeds
 from finetune import tiny
-from miniatures.runs import TINY
+from miniatures.runs import TINY, edit
 from miniatures.vanilla_3dgs import HOST
 
 from fragprune_plugins import load
@@ -31,9 +31,9 @@ def scene(photographs):
     return photographs
 
 
-def command(scene, out, *more):
+def command(scene, out, *more, host=HOST):
     words = ["-s", scene, "-m", out, "--iterations", 10, *TINY, *more]
-    return ["--", HOST / "train.py", *words]
+    return ["--", host / "train.py", *words]
 
 
 @pytest.fixture(scope="module")
@@ -161,20 +161,14 @@ def test_what_a_host_that_tidies_up_takes_away_is_missed(scene, tmp_path, files,
     with (host / "train.py").open("a") as script:
         script.write("    from pathlib import Path\n")
         script.write(f"    for each in Path(args.model_path).rglob('{files}'): {tidied}\n")
-    words = command(scene, tmp_path / "out")
-    words[1] = host / "train.py"
-    fails("run", *WORDS, *words, says=said, code=1)
+    fails("run", *WORDS, *command(scene, tmp_path / "out", host=host), says=said, code=1)
 
 
 @pytest.mark.parametrize("last", [10, 14])
 def test_a_stage_two_that_a_host_cuts_short_is_told(scene, tmp_path, last, caplog):
     host = shutil.copytree(HOST, tmp_path / "host")
-    text = (host / "train.py").read_text()
-    cut = text.replace("opt.iterations + 1", f"min(opt.iterations, {last}) + 1")
-    assert cut != text
-    (host / "train.py").write_text(cut)
-    words = command(scene, tmp_path / "out")
-    words[1] = host / "train.py"
+    edit(host / "train.py", "opt.iterations + 1", f"min(opt.iterations, {last}) + 1")
+    words = command(scene, tmp_path / "out", host=host)
     if last == 10:
         fails("run", *WORDS, *words, says="0 of 6 iterations", code=1)
     else:
@@ -186,11 +180,9 @@ def test_a_stage_two_that_a_host_cuts_short_is_told(scene, tmp_path, last, caplo
 def test_iterations_of_one_training_that_teach_nothing_are_told(scene, tmp_path, stage, caplog):
     """A host that sets no rate any more counts no step, and nothing is pressed upon."""
     host = shutil.copytree(HOST, tmp_path / "host")
-    text, rate = (host / "train.py").read_text(), "gaussians.update_learning_rate(iteration)"
-    assert rate in text
-    (host / "train.py").write_text(text.replace(rate, f"{rate} if iteration < 14 else None"))
-    words = command(scene, tmp_path / "out", "--iterations", 20)
-    words[1] = host / "train.py"
+    rate = "gaussians.update_learning_rate(iteration)"
+    edit(host / "train.py", rate, f"{rate} if iteration < 14 else None")
+    words = command(scene, tmp_path / "out", "--iterations", 20, host=host)
     run("run", "--device", "cpu", "--stage", stage, "--from-iter", 10, *words)
     steps = "13 of 19" if stage == "joint" else "3 of 9"
     assert f"learned in {steps} iterations" in caplog.text
@@ -217,8 +209,7 @@ def test_where_the_code_leaves_it_open_the_model_says_which_principal_point_it_h
     cameras.write_text(" ".join(lens))
     with (shutil.copytree(HOST, host) / "scene" / "cameras.py").open("a") as source:
         source.write("\n\ndef own(c):\n    getProjectionMatrix(1, 9, c.FoVx, c.FoVy, cx=c.cx)\n")
-    words = [host / "train.py", *command(scene, tmp_path / "out")[2:]]
-    assert run_json("run", *WORDS, "--", *words)["after"]
+    assert run_json("run", *WORDS, *command(scene, tmp_path / "out", host=host))["after"]
     assert records.recorded(records.find(tmp_path / "out")[-1]).photographs.centred
 
 

@@ -9,7 +9,7 @@ import pytest
 from cli.commands import fails, run, run_json, succeeds
 from core.test_verdict import fork as fork  # a fixture
 from finetune import tiny
-from miniatures.runs import TINY
+from miniatures.runs import TINY, edit
 from miniatures.vanilla_3dgs import HOST
 
 from fragprune_plugins.files.ply import read_ply
@@ -106,8 +106,7 @@ def test_a_model_with_exposures_learns_from_its_own_pictures(host, photographs, 
 @pytest.mark.parametrize(("old", "new"), [("/cfg_args", "/other_args"), ("source_path=", "")])
 def test_without_arguments_photographs_are_read_as_we_say(host, photographs, tmp_path, old, new):
     words = host(photographs)
-    script = words[2]
-    script.write_text(script.read_text().replace(old, new))
+    edit(words[2], old, new)
     succeeds("run", *WORDS, *words, "-r", 2, "-w")
     record = beside(tmp_path / "out/point_cloud/iteration_9/pruned.ply")
     read = recorded(record).photographs
@@ -122,9 +121,7 @@ COPIES = f"out + '/point_cloud/iteration_9', out + {BELOW!r}, copy_function=shut
 def test_what_a_host_makes_of_its_model_in_a_folder_below_is_not_taken(host, photographs, tmp_path):
     """Self-Organizing-Gaussians compresses it, and writes what comes out again."""
     words = host(photographs)
-    script = words[2]
-    text = script.read_text().replace("\nprint(", f"\nshutil.copytree({COPIES})\nprint(")
-    script.write_text(text)
+    edit(words[2], "\nprint(", f"\nshutil.copytree({COPIES})\nprint(")
     data = run_json("run", *WORDS, *words)
     assert (tmp_path / f"out{BELOW}/point_cloud.ply").exists()
     assert data["model_before"] == str(tmp_path / "out/point_cloud/iteration_9/point_cloud.ply")
@@ -247,7 +244,7 @@ def test_a_training_that_leaves_no_model_where_it_was_told_is_named(
 ):
     """A model of an earlier training is there, which is not taken for this one's."""
     words = host(photographs)
-    words[2].write_text(words[2].read_text().replace(old, new))
+    edit(words[2], old, new)
     monkeypatch.chdir(tmp_path)
     earlier = tmp_path / "out/point_cloud/iteration_8/point_cloud.ply"
     earlier.parent.mkdir(parents=True)
