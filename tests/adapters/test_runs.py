@@ -170,9 +170,7 @@ def test_a_portable_run_moves_shapes_and_leaves_thresholds_neutral(photographs, 
 def test_a_model_is_saved_though_the_host_saves_none_at_the_end(photographs, tmp_path, goal):
     script = runs.written(HOSTS["vanilla-3dgs"], tmp_path / "host") / "train.py"
     asked = "if iteration in saving_iterations"
-    text = script.read_text()
-    assert asked in text
-    script.write_text(text.replace(asked, f"{asked} and iteration <= 10"))
+    runs.edit(script, asked, f"{asked} and iteration <= 10")
     words = runs.command(script, photographs, tmp_path / "out", 10)
     summary = run(words, replace(OPTIONS, settings=replace(OPTIONS.settings, goal=goal)))
     assert summary.model_after is not None
@@ -192,10 +190,9 @@ def test_ctrl_c_keeps_a_portable_model_though_it_has_no_thresholds(photographs, 
 
 @pytest.mark.parametrize("end", ["return", "sys.exit(0)"])
 def test_a_host_that_learns_and_draws_nothing_is_always_an_error(photographs, tmp_path, end):
-    host = Path(shutil.copytree(HOST, tmp_path / "host"))
-    script = host / "train.py"
+    script = Path(shutil.copytree(HOST, tmp_path / "host")) / "train.py"
     tick = "gaussians.update_learning_rate(iteration)"
-    script.write_text(script.read_text().replace(tick, f"{tick}; {end}"))
+    runs.edit(script, tick, f"{tick}; {end}")
     words = runs.command(script, photographs, tmp_path / "out", 10)
     with pytest.raises(SessionError, match="no view of the trained model"):
         run(words, RunOptions(stage="finetune", from_iter=0, device="cpu"))
