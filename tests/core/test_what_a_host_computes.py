@@ -1,6 +1,7 @@
 """A checkout may have every name and shape of vanilla 3DGS and still compute something else."""
 
 import pytest
+from miniatures.runs import edit
 from miniatures.skeletons import skeleton
 
 from fragprune_2dgs import SurfelSplatting
@@ -227,10 +228,7 @@ def test_surfels_have_a_rule_of_their_own(tmp_path):
 
 
 def rewritten(repo: HostRepo, file: str, old: str, new: str) -> HostRepo:
-    path = repo.root / file
-    text = path.read_text()
-    assert old in text
-    path.write_text(text.replace(old, new))
+    edit(repo.root / file, old, new)
     return HostRepo(repo.root)
 
 
@@ -287,7 +285,7 @@ def test_a_drawing_function_of_a_host_returns_its_picture_as_render(tmp_path):
     returns = '\n    return {{"{}": image, "radii": radii}}\n'.format
     render.write_text(render.read_text().rstrip() + returns("render"))
     assert not errors(repo)
-    render.write_text(render.read_text().replace('"render"', '"foreground"'))
+    edit(render, '"render"', '"foreground"')
     assert "returns no render" in errors(HostRepo(tmp_path))[0]
 
 
@@ -356,6 +354,5 @@ def test_every_value_that_a_named_host_draws_is_its_parameter_activated(tmp_path
 )
 def test_one_that_leaves_out_nothing_where_3dgs_does_is_refused(tmp_path, limit, says):
     vendor(tmp_path)
-    source = tmp_path / "submodules/a/cuda/forward.cu"
-    source.write_text(source.read_text().replace(limit, ""))
+    edit(tmp_path / "submodules/a/cuda/forward.cu", limit, "")
     assert says in "; ".join(errors(skeleton(tmp_path)))
