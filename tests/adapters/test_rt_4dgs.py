@@ -2,7 +2,6 @@
 
 import itertools
 import sys
-from importlib import import_module
 
 import pytest
 import torch
@@ -18,7 +17,7 @@ from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.slicing import cutting
 from fragprune_plugins.slicing.cutting import slice_at
-from fragprune_plugins.testing.host import joint, running
+from fragprune_plugins.testing.host import joint
 from fragprune_plugins.testing.invariants.case import FixedThresholds
 from fragprune_rt_4dgs import RT4DGS, neighbours
 from fragprune_rt_4dgs.config import YAMLFile
@@ -326,14 +325,3 @@ def test_neighbours_are_the_nearest_of_their_batch():
 def test_a_ply_is_no_model_of_this_host(tmp_path):
     with pytest.raises(UsageError, match="a PLY, from which RT-4DGS cannot resume"):
         RT4DGS().checkpoint_from_ply(tmp_path / "a.ply", 3, tmp_path / "b.pth")
-
-
-def test_copies_of_a_camera_are_one_view(mini):
-    with running(**of(mini)) as host:
-        model, camera = host.model(COUNT), host.camera()
-        for iteration in (2, 3, 4):
-            host.step(model, camera, iteration)
-        (state,) = host.models.values()
-        assert len(state.stage._after) == 1
-        assert len(host.curves) == 2
-        import_module("scene")
