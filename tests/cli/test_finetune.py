@@ -136,22 +136,15 @@ def test_what_shows_beside_the_photographs_stays(data, model, words, out):
     assert not torch.equal(alone.xyz, fp.keep_best(model, 0.7, views).xyz)
 
 
-def test_photographs_of_another_scene_are_told_before_the_learning(path, model, words):
-    assert "another scene" not in run(*words, 3).stderr
-    model.f_dc.fill_(-99)
-    write_ply(path, model)
-    told = run(*words, 3).stderr
-    assert "warning: MODEL shows its photographs at" in told
-    assert "--white-background" in told
-
-
-def test_a_model_that_was_moved_is_told_before_the_learning(path, model, words):
+def test_photographs_that_the_model_does_not_show_are_told_before_the_learning(path, model, words):
     """However much better a dark picture is than 12 dB."""
-    moved = replace(model, xyz=model.xyz + torch.tensor([1.0, 0.0, 0.0]))
-    write_ply(path, moved)
-    told = run(*words, 3).stderr
-    assert "warning: MODEL shows its photographs at" in told
-    assert "--self" in told
+    assert "another scene" not in run(*words, 3).stderr
+    moved = model.xyz + torch.tensor([1.0, 0.0, 0.0])
+    for other in ({"f_dc": torch.full_like(model.f_dc, -99)}, {"xyz": moved}):
+        write_ply(path, replace(model, **other))
+        told = run(*words, 3).stderr
+        assert "warning: MODEL shows its photographs at" in told
+        assert all(option in told for option in ("--white-background", "--self"))
 
 
 ALIKE = {"train": "all", "opacity_lr": None, "seed": 0, "views_per_step": 1}
