@@ -59,7 +59,7 @@ def test_frames_are_called_faster_only_beyond_two_standard_errors(ms, error, cla
 
 def test_noise_is_noise_whichever_of_the_two_comes_first():
     quiet, noisy = measured(20, 1.0, 30, 0.0), measured(20, 1.6, 30, 0.35)
-    slow, unsure = measured(20, 42.92, 30, 5.05), measured(20, 3.04, 30, 6.26)  # by more than it is
+    slow, unsure = measured(20, 42.92, 30, 5.05), measured(20, 3.04, 30, 6.26)  # factor < error
     for pair in ((quiet, noisy), (noisy, quiet), (slow, unsure), (unsure, slow)):
         assert "no difference beyond the noise" in gain(*pair)
 
