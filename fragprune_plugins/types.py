@@ -58,21 +58,24 @@ def short(value: Any) -> str:
     return repr(value)
 
 
-def check_tensor(name: str, tensor: Tensor | None, *shape: int | None, whole: bool = False) -> None:
-    """Raise InputError unless tensor is None or holds real numbers in the shape.
+def check_tensor(
+    name: str, tensor: Any, *shape: int | None, whole: bool = False, needed: bool = False
+) -> None:
+    """Raise InputError unless tensor is None and not needed, or holds real numbers in the shape.
 
     Args:
         tensor: the value to check; only a dense tensor with its data in memory passes.
         shape: lengths; None stands for any.
         whole: require an integer type instead of a floating one.
     """
-    if tensor is None:
+    if tensor is None and not needed:
         return
     import torch
 
     found = expected = ""
     if not isinstance(tensor, torch.Tensor):
-        found, expected = f"a {type(tensor).__name__}", "a torch.Tensor"
+        found = "None" if tensor is None else f"a {type(tensor).__name__}"
+        expected = "a torch.Tensor"
     elif tensor.is_meta or tensor.layout is not torch.strided:
         found, expected = f"{tensor.layout} on {tensor.device}", "a dense tensor with its numbers"
     elif tensor.dtype is torch.bool or tensor.is_complex() or tensor.is_floating_point() is whole:
@@ -88,13 +91,6 @@ def check_tensor(name: str, tensor: Tensor | None, *shape: int | None, whole: bo
         raise InputError(name, found, expected, "Check the call's arguments.")
 
 
-def require_tensor(name: str, tensor: Tensor, *shape: int | None) -> None:
-    """Raise InputError as ``check_tensor`` does, and if there is no tensor."""
-    if tensor is None:
-        raise InputError(name, "None", "a torch.Tensor", "Check the call's arguments.")
-    check_tensor(name, tensor, *shape)
-
-
 def check_fields(thing: Any, **shapes: tuple[int | None, ...]) -> None:
     """Check a dataclass's tensors, as ``check_tensor`` does; those without a default must be there.
 
@@ -103,8 +99,8 @@ def check_fields(thing: Any, **shapes: tuple[int | None, ...]) -> None:
     """
     own, kind = thing.__dataclass_fields__, type(thing).__name__
     for name, shape in shapes.items():
-        check = require_tensor if own[name].default is MISSING else check_tensor
-        check(f"{kind}.{name}", getattr(thing, name), *shape)
+        needed = own[name].default is MISSING
+        check_tensor(f"{kind}.{name}", getattr(thing, name), *shape, needed=needed)
 
 
 def check_values(thing: Any, **checks: tuple[bool, object]) -> None:

@@ -18,7 +18,7 @@ from fragprune_graphdeco.call import CallInSource, RasterizerCall, drawing_funct
 from fragprune_graphdeco.densifying import clones, splits
 from fragprune_graphdeco.drawing import Drawing, pictures
 from fragprune_graphdeco.kernels import SPLAT, Kernel, read_kernels, vendored
-from fragprune_graphdeco.reading import module_of
+from fragprune_graphdeco.reading import mentions, module_of
 from fragprune_graphdeco.syntax import entries, every, text_of
 from fragprune_plugins.adapting import (
     CHECKPOINT_KEY,
@@ -306,13 +306,13 @@ class GraphdecoAdapter(ScriptAdapter):
             if made and "GaussianModel" not in made:
                 missing.append(f"{script} makes {', '.join(dict.fromkeys(made))}")
             rate = [] if self.steps_by_rendering or not made else ["update_learning_rate"]
-            called = repo.mentions([module_of(script)], rate)
+            called = mentions(repo, [module_of(script)], rate)
             missing += [f"{script} calls no {each}" for each in rate if each not in called]
         both = (repo.function(MODEL, f"GaussianModel.{name}") for name in ("capture", "restore"))
         missing += filter(None, [reading.uneven(*both)])
         for module, _, name in (each.rpartition(":") for each in self.own_names):
             module = module or MODEL
-            missing += [] if repo.mentions([module], [name]) else [f"no {name} in {module}"]
+            missing += [] if mentions(repo, [module], [name]) else [f"no {name} in {module}"]
         missing += failing.reasons(repo, self.scripts_of(repo))
         packages = dict.fromkeys([self.package, *(c.package for c in self.calls if c.package)])
         return [

@@ -17,7 +17,7 @@ from fragprune_graphdeco.call import RASTERIZER
 from fragprune_graphdeco.drawing import Drawing, arguments, drawing_in
 from fragprune_graphdeco.kernels import DISTANCE, ORDER, SPLAT, read_kernels
 from fragprune_graphdeco.photographs import unlike
-from fragprune_graphdeco.reading import ModelClass
+from fragprune_graphdeco.reading import ModelClass, mentions
 from fragprune_graphdeco.syntax import assigned, every, is_off, off_by_default, passed, text_of
 from fragprune_plugins.adapting import HostRepo, Plain, change_of, nodes
 
@@ -122,11 +122,11 @@ def _of_others(model: ModelClass) -> Iterator[str]:
     change the picture.
     """
     repo, scripts = model.repo, reading.training_modules(model.repo)
-    with_model = [each for each in scripts if repo.mentions([each], [model.name])]
+    with_model = [each for each in scripts if mentions(repo, [each], [model.name])]
     for other in _models(repo):
         differs = other.name != model.name
-        alone = differs and any(not repo.mentions([each], [other.name]) for each in with_model)
-        if other.module == model.module or alone or not repo.mentions(scripts, [other.name]):
+        alone = differs and any(not mentions(repo, [each], [other.name]) for each in with_model)
+        if other.module == model.module or alone or not mentions(repo, scripts, [other.name]):
             continue
         trained, names = f"{other.name}, which a script here trains:", saved.columns(other)[1]
         whole = all(any(each.startswith(column) for each in names) for column in saved.COLUMNS)
@@ -182,7 +182,7 @@ def _of_scripts(model: ModelClass) -> Iterator[str]:
                 at = repo.at(script, each.lineno)
                 yield f"its PLY was not read: {each.name} changes {', '.join(changed)} ({at})"
     made = {each: name for each in scripts for name in reading.made_models(repo, each)}
-    if made and model.method("get_xyz") and not repo.mentions(scripts, [model.name]):
+    if made and model.method("get_xyz") and not mentions(repo, scripts, [model.name]):
         script, name = next(iter(made.items()))
         yield f"its PLY was not read: {script}.py trains {name}, not {model.name}"
 
@@ -240,7 +240,7 @@ def _of_drawing(repo: HostRepo, modules: Iterable[str]) -> Iterator[tuple[str, b
     """
     for module in modules:
         functions = drawing_in(repo, module)
-        named = repo.mentions(reading.training_modules(repo), [each.name for each in functions])
+        named = mentions(repo, reading.training_modules(repo), [each.name for each in functions])
         instead = [n for n in functions[1:] if n.name in named and "render" not in named]
         for function in [*functions[:1], *instead[:1]]:
             yield from Drawing(repo, module, function).reasons()

@@ -47,6 +47,29 @@ _ASKED = re.compile(r"self\.(\w+) is not None")
 _OTHER_FLAGS = ("hydra", "omegaconf", "tyro", "jsonargparse", "fire", "gin", "click", "absl")
 
 
+@lru_cache(maxsize=256)
+def _identifiers(tree: ast.Module | None) -> dict[str, int]:
+    """Every name, attribute, definition and parameter in a tree, with its first line."""
+    lines: dict[str, int] = {}
+    for node in nodes(tree):
+        for kind in ("id", "attr", "name", "arg"):
+            name = getattr(node, kind, None)
+            if isinstance(name, str):
+                lines.setdefault(name, getattr(node, "lineno", 0))
+    return lines
+
+
+def mentions(repo: HostRepo, modules: Iterable[str], names: Iterable[str]) -> dict[str, str]:
+    """Which of the names occur as identifiers, attributes or parameters, and where."""
+    wanted = set(names)
+    seen: dict[str, str] = {}
+    for module in modules:
+        lines = _identifiers(repo.tree(module))
+        for name in (each for each in lines if each in wanted):
+            seen.setdefault(name, f"{module}:{lines[name]}")
+    return seen
+
+
 @dataclass(frozen=True)
 class ModelClass:
     """A class of Gaussians in a checkout."""
@@ -285,7 +308,7 @@ def training_scripts(repo: HostRepo, *patterns: str) -> tuple[str, ...]:
         paths = [each.relative_to(repo.root) for each in files if "." not in each.stem]
         parts = {each.as_posix(): ".".join(each.with_suffix("").parts) for each in paths}
         wanted = ("training_setup", "backward")
-        if found := [k for k, name in parts.items() if len(repo.mentions([name], wanted)) > 1]:
+        if found := [k for k, name in parts.items() if len(mentions(repo, [name], wanted)) > 1]:
             return tuple(found)
     return ()
 

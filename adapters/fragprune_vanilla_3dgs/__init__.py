@@ -139,7 +139,7 @@ class Vanilla3DGS(GraphdecoAdapter):
         if dialect.outputs < OUTPUTS:
             if "debug" not in dialect.settings:
                 return "mid-July 2023"
-            later = repo.mentions(["arguments"], ["random_background"])
+            later = reading.mentions(repo, ["arguments"], ["random_background"])
             return "October 2023" if later else "late July 2023"
         has_separate_sh = "separate_sh" in (repo.parameters("gaussian_renderer", "render") or ())
         return "October 2024" if has_separate_sh else "August 2024"

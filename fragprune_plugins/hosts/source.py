@@ -6,7 +6,6 @@ import ast
 import os
 import re
 import warnings
-from collections.abc import Iterable
 from contextlib import suppress
 from functools import cache, cached_property, lru_cache
 from importlib.metadata import distributions
@@ -66,18 +65,6 @@ def imported(tree: ast.Module | None) -> list[str]:
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
             names[node.module.split(".")[0]] = None
     return list(names)
-
-
-@lru_cache(maxsize=256)
-def _identifiers(tree: ast.Module) -> dict[str, int]:
-    """Every name, attribute, definition and parameter in a tree, with its first line."""
-    lines: dict[str, int] = {}
-    for node in nodes(tree):
-        for kind in ("id", "attr", "name", "arg"):
-            name = getattr(node, kind, None)
-            if isinstance(name, str):
-                lines.setdefault(name, getattr(node, "lineno", 0))
-    return lines
 
 
 @cache
@@ -202,17 +189,6 @@ class HostRepo:
             return [alias.name for alias in node.names]
         base = self.absolute(module, node)
         return [base, *(f"{base}.{alias.name}" for alias in node.names)]
-
-    def mentions(self, modules: Iterable[str], names: Iterable[str]) -> dict[str, str]:
-        """Which of the names occur as identifiers, attributes or parameters, and where."""
-        wanted = set(names)
-        seen: dict[str, str] = {}
-        for module in modules:
-            tree = self.tree(module)
-            lines = _identifiers(tree) if tree else {}
-            for name in (each for each in lines if each in wanted):
-                seen.setdefault(name, f"{module}:{lines[name]}")
-        return seen
 
     @cached_property
     def imported(self) -> set[str]:

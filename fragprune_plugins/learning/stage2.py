@@ -61,11 +61,6 @@ _Picture = tuple[Hashable, int]
 """A view, and the part of it."""
 
 
-def learned_thresholds(inputs: RasterInputs, store: ThresholdStore) -> Tensor | None:
-    """The store's own, none while it is neutral."""
-    return None if store.neutral else store.values
-
-
 def evenly_spaced(views: Sequence[View], most: int) -> Sequence[View]:
     """Views at even distances, so many at most, from the first on."""
     return views[:: max(1, -(-len(views) // most))]
@@ -95,7 +90,7 @@ class Stage2:
         settings: Settings,
         schedule: Schedule | None = None,
         *,
-        truncate: Truncate = learned_thresholds,
+        truncate: Truncate,
         views: Mapping[Any, Callable[[], object]] = MappingProxyType({}),
         watch: Callable[[StepStats], None] | None = None,
         parameters: Callable[[], Mapping[str, Tensor]] = dict,
@@ -282,18 +277,14 @@ class Stage2:
             return self.plan.opacity_lr
         return base * self.plan.decay
 
-    def expect_sound(self, gradients: Mapping[str, Tensor]) -> None:
-        """Check gradients before the driver's optimizer steps.
-
-        Args:
-            gradients: of the parameters that train, by their names. Those of the thresholds are
-                looked at too.
+    def expect_sound(self) -> None:
+        """Check gradients before the driver's optimizer steps, those of the thresholds too.
 
         Raises:
             DivergedError: a gradient, or its square, is NaN or infinite.
         """
-        ours = self.store.logits.grad
-        known = dict(gradients) | ({} if ours is None else {"thresholds": ours})
+        given = {**self.parameters(), "thresholds": self.store.logits}.items()
+        known = {name: each.grad.to_dense() for name, each in given if each.grad is not None}
         if are_finite(known.values()):
             return
         broken = not_finite({name: each.float().square() for name, each in known.items()})

@@ -12,7 +12,7 @@ VIEW = look_at((0, 0, -3), (0, 0, 0), width=8, height=8, fov_y=50)
 
 def stage(dropout):
     settings = Settings(iterations=STEPS, train="opacity", goal=Pressure(1e-3), dropout=dropout)
-    return Stage2(ThresholdStore(COUNT), settings)
+    return Stage2(ThresholdStore(COUNT), settings, truncate=lambda inputs, store: None)
 
 
 def dropped(it: Stage2, step: int, opacity: float = 0.5):

@@ -34,9 +34,13 @@ class Turns(Schedule):
         return StepPlan(step % 2 == 1, 0.1, 0.02, step / 10, 0.25)
 
 
+def learned(inputs, store: ThresholdStore) -> torch.Tensor | None:
+    return None if store.neutral else store.values
+
+
 def stage(**options) -> Stage2:
     settings = options.pop("settings", Settings(iterations=10, goal=Pressure(1e-2)))
-    return Stage2(ThresholdStore(5), settings, **options)
+    return Stage2(ThresholdStore(5), settings, truncate=learned, **options)
 
 
 def step(it: Stage2, *views: str, loss: float = 0.5):
@@ -271,7 +275,7 @@ def test_what_was_drawn_before_a_checkpoint_is_counted_on_the_gpu_of_what_is_dra
     it = stage()
     step(it, "a", "b")
     tensors, plain = it.state_dict("ab")
-    again = Stage2(ThresholdStore(0, "meta"), it.settings)
+    again = Stage2(ThresholdStore(0, "meta"), it.settings, truncate=learned)
     again.load_state_dict(tensors, plain, "ab")
     kept = [*again._before.values(), *again._after.values()]
     assert [each.device.type for each in kept] == ["meta"] * 4
@@ -324,21 +328,22 @@ def reset(share: float) -> torch.Tensor:
 
 
 def test_thresholds_do_not_begin_right_after_a_reset_of_opacities():
-    it = Stage2(ThresholdStore(100), Settings(iterations=10))
+    it = Stage2(ThresholdStore(100), Settings(iterations=10), truncate=learned)
     with pytest.raises(ResetError, match=r"at most 0.01 in 95% of 100 Gaussians"):
         it.begin(lambda: reset(0.95))
 
 
 @pytest.mark.parametrize(("goal", "share"), [(Pressure(), 0.8), (Control(), 1.0)])
 def test_many_faint_gaussians_are_no_reset_and_a_control_may_follow_one(goal, share):
-    it = Stage2(ThresholdStore(100), Settings(iterations=10, goal=goal))
+    it = Stage2(ThresholdStore(100), Settings(iterations=10, goal=goal), truncate=learned)
     it.begin(lambda: reset(share))
     assert it.store.opened == (goal != Control())
 
 
 def test_joint_learning_warns_of_a_reset_and_goes_on_with_the_training(caplog):
     settings = Settings(iterations=10)
-    it = Stage2(ThresholdStore(100), settings, JointSchedule(settings, from_step=1))
+    schedule = JointSchedule(settings, from_step=1)
+    it = Stage2(ThresholdStore(100), settings, schedule, truncate=learned)
     it.begin(lambda: reset(1.0))
     assert "[opacity-reset]" in caplog.text
     assert it.store.opened
@@ -358,7 +363,13 @@ def drawn_by_one(it: SharedStage, names: str) -> list[list[float]]:
 def test_what_other_processes_drew_counts_like_ones_own_and_in_the_same_order(own):
     settings, told = Settings(iterations=10, goal=Pressure(1e-2), views_per_step=2), ([], [])
     whole, it = (
-        SharedStage(ThresholdStore(5), settings, views={"a": None, "b": None}, watch=each.append)
+        SharedStage(
+            ThresholdStore(5),
+            settings,
+            truncate=learned,
+            views={"a": None, "b": None},
+            watch=each.append,
+        )
         for each in told
     )
     for _ in range(2):

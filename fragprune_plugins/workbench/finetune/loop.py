@@ -300,8 +300,7 @@ class Training:
         self.processes.went_backward(stage, self._learned(), shots, waiting, due=due)
         for group in self.optimizer.param_groups:
             group["lr"] = stage.rate(group["name"], self.rates[group["name"]])
-        leaves = self.parameters().items()
-        stage.expect_sound({name: leaf.grad for name, leaf in leaves if leaf.grad is not None})
+        stage.expect_sound()
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         stage.end()

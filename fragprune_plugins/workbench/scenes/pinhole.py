@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.errors import InputError
-from fragprune_plugins.types import View, check_lens, check_tensor, one_line, require_tensor
+from fragprune_plugins.types import View, check_lens, check_tensor, one_line
 
 ROTATION_TOLERANCE: Final = 1e-2
 """Most that R R^T of a camera's rotation differs from 1; matrices come rounded to a few digits."""
@@ -79,8 +79,8 @@ def focal(side: float, angle: float) -> float:
 
 def check_pose(rotation: Tensor, translation: Tensor) -> None:
     """Raise InputError unless it is a rotation, and a place within ``DISTANCE_MAX``."""
-    require_tensor("rotation", rotation, 3, 3)
-    require_tensor("translation", translation, 3)
+    check_tensor("rotation", rotation, 3, 3, needed=True)
+    check_tensor("translation", translation, 3, needed=True)
     exact = rotation.detach().double()
     skew = float((exact @ exact.T - torch.eye(3).to(exact)).abs().max())
     # NaN, too, is not within the tolerance.
