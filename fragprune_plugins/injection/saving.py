@@ -24,8 +24,7 @@ def on_save(session: SessionState, call: SeamCall) -> Any:
 
     Values that are not finite stop both. Without thresholds an earlier file's sidecar goes.
     """
-    check_learned(session, call.model)
-    state = session.models.get(call.model)
+    model, state = learner(session, call)
     if state is None or call.first is None:
         result = call.run()
         if not (session.learn or call.first is None):
@@ -39,15 +38,30 @@ def on_save(session: SessionState, call: SeamCall) -> Any:
             beside = path.parent / other.relative_to(folder)
             beside.parent.mkdir(parents=True, exist_ok=True)
             other.replace(beside)
-        session.save(call.model, path, folder / path.name)
+        session.save(model, path, folder / path.name)
     return result
 
 
-def check_learned(session: SessionState, model: Any) -> None:
-    """Raise DivergedError, before a save, if a learning model has NaN or infinity."""
+def learner(session: SessionState, call: SeamCall) -> tuple[Any, ModelState | None]:
+    """Of a model that is saved, or else of the one that it is an exact copy of, what is known.
+
+    Raises:
+        DivergedError: it learns, and has NaN or infinity.
+    """
+    model = call.model
+    if session.models and model not in session.models:
+        of = session.adapter.means, session.adapter.opacities
+        for known in session.models:
+            if all(torch.equal(each(known).cpu(), each(model).cpu()) for each in of):
+                model = known
+                break
+        else:
+            said = "%s: without cutoffs: no model that learns has exactly these Gaussians"
+            log.warning(said, call.seam)
     state = session.models.get(model)
     if state is not None and state.stage is not None and state.stage.plan is not None:
         state.stage.check()
+    return model, state
 
 
 def on_load(session: SessionState, call: SeamCall) -> Any:
@@ -121,10 +135,8 @@ def on_capture(session: SessionState, call: SeamCall) -> Any:
 
     Neutral thresholds go in too in stage 2: they mark the checkpoint as one of stage 2.
     """
-    model = call.model
-    check_learned(session, model)
+    model, state = learner(session, call)
     result, session.held = call.run(), None
-    state = session.models.get(model)
     if state is not None and (session.standing_still(model) or state.store.cuts):
         session.expect_rows(model, state, str(call.seam))
         held = optimizer_state(result, f"{session.adapter.name}: checkpoint")

@@ -1,5 +1,6 @@
 """Invariant 5 where files meet other files; the round trips are tests/conformance's."""
 
+import copy
 from dataclasses import replace
 
 import pytest
@@ -9,6 +10,7 @@ from miniatures.vanilla_3dgs import joint
 from fragprune_plugins import Control, Pressure, Settings, ThresholdStore
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply
+from fragprune_plugins.hosts.adapter import CHECKPOINT_KEY, optimizer_state
 from fragprune_plugins.workbench.models.formats.ply import write_ply
 
 
@@ -51,6 +53,34 @@ def test_a_stop_is_drawn_with_and_saved_and_drawn_with_again(tmp_path, monkeypat
         again.load_ply(str(path))
         assert torch.equal(host.render(host.camera(), again)["render"], before)
         assert seen == [0.3]
+
+
+def test_an_exact_copy_of_a_model_is_saved_with_its_thresholds(tmp_path, caplog):
+    path = tmp_path / "copy.ply"
+    with joint() as host:
+        model = trained(host)
+        values = host.store(model).values.detach().clone()
+        other = copy.deepcopy(model)
+        other.save_ply(str(path))
+        held = optimizer_state(other.capture(), "copy")[CHECKPOINT_KEY]
+    assert torch.equal(sidecar.load(path, 20)[0].values, values)
+    assert torch.equal(held["logits"], sidecar.load(path)[0].logits)
+    assert caplog.messages == []
+
+
+def test_a_copy_that_is_another_model_by_now_is_saved_loudly(tmp_path, caplog):
+    """Which thresholds were the copy's is not known: those of the model have learned since."""
+    path = tmp_path / "best.ply"
+    with joint() as host:
+        model = trained(host)
+        best = copy.deepcopy(model)
+        host.step(model, host.camera(), 4)
+        best.save_ply(str(path))
+        best.capture()
+    assert not sidecar.find(path)
+    said = "without cutoffs: no model that learns has exactly these Gaussians"
+    places = [f"GaussianModel.{each}" for each in ("save_ply", "capture")]
+    assert all(f"{at}: {said}" in m for at, m in zip(places, caplog.messages, strict=True))
 
 
 def test_a_model_loaded_without_a_sidecar_forgets_the_thresholds_it_had(tmp_path):
