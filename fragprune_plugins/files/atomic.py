@@ -24,6 +24,7 @@ WAIT = 60.0
 """Seconds to wait for another process that writes the same file."""
 
 _WITHOUT_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL}
+_WITHOUT_LOCKS |= {errno.EACCES, errno.EPERM, errno.EROFS}  # a file, maybe, in a locked folder
 
 
 def in_flight(path: Path, what: str) -> Path:

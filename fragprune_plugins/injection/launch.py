@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
 import time
 from functools import partial
@@ -37,6 +38,7 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
         UnknownHostError: no adapter fits the script's folder.
         HostNeedsError: packages that the script imports, or its data, are missing.
         HostFailed: the host raised an exception or ended with an error code.
+        OutputError: another process trains into the same folder.
         RanksError: several processes train the model together.
         Interrupted: Ctrl-C in stage 2, or SIGTERM (Terminated). Learned thresholds were saved.
         DivergedError: NaN or infinity in stage 2. Nothing of it was saved.
@@ -60,7 +62,10 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
     _expect_engine(trainer, options, device, plugins)
     started = time.perf_counter()
     trains = _expect_trainable(host, repo, trainer, options, device)
-    with tempfile.TemporaryDirectory(prefix="fragprune-") as scratch:
+    own = "run" if options.stage == "auto" or options.settings.goal.presses else "control"
+    folder = host.output.resolve() if trains and host.output else None
+    alone = atomic.locked(folder, 0, own) if folder else contextlib.nullcontext()
+    with tempfile.TemporaryDirectory(prefix="fragprune-") as scratch, alone:
         stages = Stages(host, repo, trainer, plugins, options, device, Path(scratch))
         named = {"off": stages.observe, "joint": stages.joint, "finetune": stages.finetune}
         named.get(options.stage if trains else "off", stages.train_then_finetune)()

@@ -15,6 +15,7 @@ from fragprune_plugins import load
 from fragprune_plugins.adapting import HostRepo, ModelFileError, UsageError
 from fragprune_plugins.errors import OutputError
 from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.atomic import in_flight, locked
 from fragprune_plugins.injection import launch
 from fragprune_plugins.learning.schedule import USUAL_STOP
 from fragprune_plugins.testing import mutations
@@ -64,6 +65,19 @@ def test_a_host_trains_with_the_usual_stop_and_its_model_keeps_it(trained):
     _, found, _ = trained
     assert load(found["model_before"]).stop is None
     assert load(found["model_after"]).stop == USUAL_STOP
+
+
+def test_two_trainings_into_one_folder_at_once_are_refused_and_a_dead_ones_lock_is_not(
+    folder, tmp_path
+):
+    (out, words), left = folder, in_flight(tmp_path / "out", "run")
+    finetune = ["--stage", "finetune", *WORDS]
+    with locked(out, wait=0, what="run"):
+        fails("run", *finetune, *words, says=(str(out), "another process"), code=1)
+        assert run("run", *finetune, "--control", *words).exit_code == 0  # into its own folder
+    left.touch()  # as a killed process leaves it
+    succeeds("run", *finetune, *words)
+    assert not left.exists()
 
 
 @pytest.mark.parametrize(("words", "threads"), [([], 1), (["--threads", 3], 3)])

@@ -111,7 +111,7 @@ def test_who_waits_for_a_lock_gets_it_after_its_file_was_removed(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP, errno.EIO])
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP, errno.EROFS, errno.EIO])
 def test_where_there_are_no_locks_writing_goes_on_without(tmp_path, monkeypatch, number):
     def flock(*_):
         in_flight(tmp_path / "a.txt", "lock").unlink()  # as another process without locks may do
