@@ -65,8 +65,12 @@ def find(adapter: ScriptAdapter, host: HostCommand, output: Path | None) -> Star
     where, flag = output or "no output folder", host.line.spellings("resume")[-1]
     saved, newer = files(adapter, output), 0
     while saved and _learned(saved[-1][1]):
-        saved.pop()
+        at, path = saved.pop()
         newer += 1
+        if at == host.iterations:
+            found, expected = f"{path}, which learned within its training", "one that did not"
+            remedy = f"To go on from it, or to start from another, name it with {flag}."
+            raise UsageError("--stage finetune", found, expected, remedy)
     if not saved:
         found, expected = "no model", f"{flag} FILE, or {host.line.output[-1]} DIR of a training"
         remedy = "Add one of these flags to the host's command."

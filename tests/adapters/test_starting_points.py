@@ -111,6 +111,21 @@ def test_training_again_over_a_result_of_stage_two_makes_it_stage_ones(photograp
     assert f"iteration 17, {out / ply(17)}:" in started(out, 17)
 
 
+@pytest.mark.parametrize("earlier", [True, False], ids=["an older checkpoint", "its own PLY"])
+def test_after_a_joint_training_no_older_file_is_taken_in_its_place(
+    photographs, out, started, tmp_path, earlier
+):
+    folder = out if earlier else tmp_path / "joint"
+    words = command(photographs, folder, 10, "--save_iterations", 4)
+    run(words, replace(OPTIONS, stage="joint", from_iter=6))
+    assert sidecar.belongs(folder / ply(10))
+    with pytest.raises(UsageError, match="learned within its training") as error:
+        started(folder, 10)
+    assert str(folder / ply(10)) in error.value.found
+    line = started(folder, 10, "--start_checkpoint", folder / ply(10))
+    assert f"{folder / ply(10)}: the command names it" in line
+
+
 def test_a_later_ply_goes_before_an_early_checkpoint(photographs, tmp_path, started):
     words = command(photographs, tmp_path, 10, "--checkpoint_iterations", 5)
     run(words, OFF)
