@@ -23,11 +23,12 @@ from fragprune_plugins.learning.adam import stepping_fused
 
 _CUDA = re.compile(r"cuda(:\d+)?$")
 _NAMES = frozenset((str, torch.device))  # looked up by type: every torch call comes by
+_NUMBERS = _NAMES | {int}  # where a number can only be a GPU's
 
 
 def _redirected(value: Any) -> Any:
-    """Replace "cuda", "cuda:N" and CUDA's torch.device by the CPU; return other values as given."""
-    if isinstance(value, str) and _CUDA.match(value):
+    """Replace "cuda", "cuda:N", N and CUDA's torch.device by the CPU; return others as given."""
+    if type(value) is int or (isinstance(value, str) and _CUDA.match(value)):
         return "cpu"
     if isinstance(value, torch.device) and value.type == "cuda":
         return torch.device("cpu")
@@ -45,29 +46,37 @@ class _Redirect(TorchFunctionMode):
         kwargs: dict[str, Any] | None = None,
     ) -> Any:
         kwargs = kwargs or {}
-        if func is torch.Tensor.cuda:
+        if func is torch.Tensor.cuda or func is torch.Tensor.pin_memory:
             return args[0]
         if func is torch.Tensor.get_device:  # hosts pass it to .to(), which refuses -1
             return torch.device("cpu")
-        if not _NAMES.isdisjoint(map(type, args)):
-            args = tuple(_redirected(a) for a in args)
+        names = _NUMBERS if func is torch.Tensor.to else _NAMES
+        if not names.isdisjoint(map(type, args)):
+            args = tuple(_redirected(a) if type(a) in names else a for a in args)
         if "device" in kwargs:
             kwargs["device"] = _redirected(kwargs["device"])
+        kwargs.pop("pin_memory", None)
         return func(*args, **kwargs)
 
 
-class _Event:
-    """A CUDA event that reads the wall clock."""
+class _Generator(torch.Generator):
+    def __new__(cls, device: Any = "cpu") -> _Generator:
+        return super().__new__(cls, _redirected(device))  # type: ignore[call-arg]
+
+
+class _Event(contextlib.nullcontext[None]):
+    """A CUDA event that reads the wall clock; also a stream or a device, which order nothing."""
 
     def __init__(self, *_: Any, **__: Any) -> None:
+        super().__init__()
         self._time = 0.0
+
+    def __getattr__(self, _: str) -> Any:  # CPU work is done when a call returns
+        return _nothing
 
     def record(self, *_: Any) -> None:
         """Store the current time."""
         self._time = time.perf_counter()
-
-    def synchronize(self) -> None:
-        """Return at once: CPU work is done when a call returns."""
 
     def query(self) -> bool:
         """Whether the work before the event is done: always."""
@@ -84,10 +93,11 @@ def _nothing(*_: Any, **__: Any) -> int:
 
 
 _SUBSTITUTES: dict[str, Any] = {
+    **dict.fromkeys(("Event", "Stream", "stream", "current_stream", "default_stream"), _Event),
+    "device": _Event,
     **dict.fromkeys(("set_device", "synchronize", "empty_cache", "current_device"), _nothing),
     **dict.fromkeys(("reset_peak_memory_stats", "reset_max_memory_allocated"), _nothing),
     **dict.fromkeys(("memory_allocated", "max_memory_allocated", "memory_reserved"), _nothing),
-    "Event": _Event,
     "FloatTensor": torch.FloatTensor,
     "IntTensor": torch.IntTensor,
 }
@@ -98,11 +108,14 @@ def cpu_only() -> Iterator[None]:
     """Inside, torch calls that name CUDA run on the CPU, and checkpoints load to the CPU."""
     # Optimizers import torch._dynamo, which would take our substitutes for torch's functions.
     importlib.import_module("torch._dynamo")
-    load, run = torch.load, threading.Thread.run
+    load, run, parse = torch.load, threading.Thread.run, torch._C._nn._parse_to
 
     @functools.wraps(load)
     def load_to_cpu(f: Any, map_location: Any = None, *args: Any, **kwargs: Any) -> Any:
         return load(f, _redirected(map_location or "cpu"), *args, **kwargs)
+
+    def parse_redirected(*args: Any, **kwargs: Any) -> Any:  # of nn.Module.to
+        return parse(*map(_redirected, args), **{k: _redirected(v) for k, v in kwargs.items()})
 
     def run_redirected(thread: threading.Thread) -> None:  # a mode is its thread's own
         with _Redirect():
@@ -110,7 +123,8 @@ def cpu_only() -> Iterator[None]:
 
     with (
         mock.patch.multiple(torch.cuda, **_SUBSTITUTES),
-        mock.patch.object(torch, "load", load_to_cpu),
+        mock.patch.multiple(torch, load=load_to_cpu, Generator=_Generator),
+        mock.patch.object(torch._C._nn, "_parse_to", parse_redirected),
         mock.patch.object(threading.Thread, "run", run_redirected),
         stepping_fused(),
         _Redirect(),

@@ -28,7 +28,7 @@ FACTORIES = {
 }
 
 
-@pytest.mark.parametrize("name", ["cuda:7", torch.device("cuda", 0)], ids=str)
+@pytest.mark.parametrize("name", ["cuda:7", torch.device("cuda", 0), 0], ids=str)
 @pytest.mark.parametrize("make", FACTORIES.values(), ids=FACTORIES)
 def test_tensors_asked_for_on_cuda_are_made_on_the_cpu(make, name):
     with cpu_only():
@@ -41,8 +41,30 @@ def test_cuda_methods_return_the_tensor_itself_as_on_a_gpu_they_would():
         assert tensor.cuda() is tensor
         assert tensor.cuda(0) is tensor
         assert tensor.cuda(non_blocking=True) is tensor
+        assert tensor.pin_memory() is tensor
         assert module.cuda() is module
     assert module.weight.device.type == "cpu"
+
+
+def test_numbers_that_are_no_device_and_flags_stay_what_they_are():
+    with cpu_only():
+        assert torch.arange(3).sum(0) == 3
+        assert torch.ones(2).to(torch.float64, True).dtype == torch.float64
+        assert torch.nn.Linear(2, 2).to(torch.float64, True).weight.dtype == torch.float64
+        assert torch.zeros(3, pin_memory=True, device="cpu").tolist() == [0, 0, 0]
+
+
+def test_streams_order_nothing_and_random_numbers_come_from_the_cpu():
+    with cpu_only():
+        stream = torch.cuda.Stream(device=0, priority=-1)
+        with torch.cuda.stream(stream), torch.cuda.device(0):
+            tensor = torch.ones(2, device="cuda")
+        torch.cuda.current_stream().wait_stream(stream)
+        stream.synchronize()
+        assert tensor.sum() == 2
+        for made in (torch.Generator(device="cuda"), torch.Generator("cuda:0"), torch.Generator()):
+            drawn = torch.rand(2, generator=made.manual_seed(3), device="cuda")
+            assert torch.equal(drawn, torch.rand(2, generator=torch.Generator().manual_seed(3)))
 
 
 def test_threads_that_a_host_starts_are_redirected_too():
@@ -96,7 +118,7 @@ def test_checkpoints_load_to_the_cpu(tmp_path, where):
 def test_everything_is_put_back_however_the_block_ends(error):
     def substituted():
         names = redirection._SUBSTITUTES
-        return [torch.load, torch.Tensor.cuda, *(getattr(torch.cuda, name) for name in names)]
+        return [torch.load, torch.Generator, *(getattr(torch.cuda, name) for name in names)]
 
     before = substituted()
     with pytest.raises(error) if error else contextlib.nullcontext(), cpu_only():
