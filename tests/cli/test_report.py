@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import sys
+from dataclasses import replace
 
 import pytest
 import torch
@@ -147,11 +148,30 @@ def test_without_the_photographs_there_are_curves_and_the_reason(out, data, reco
     assert run_error("report", out, *elsewhere, "--json")["code"] == "dataset"
 
 
-@pytest.mark.parametrize("edit", [Model.untruncated, lambda m: m.keep(m.opacity[:, 0] > 0)])
+@pytest.mark.parametrize(
+    "edit",
+    [
+        Model.untruncated,
+        lambda m: m.keep(m.opacity[:, 0] > 0),
+        lambda m: replace(m, opacity=m.opacity - 1),  # as another training does
+    ],
+)
 def test_a_model_that_was_edited_since_is_not_shown_with_its_old_figures(out, data, edit):
     fp.save(out / "pruned.ply", edit(load(out / "pruned.ply")))
-    result = run("report", out, "--data", data)
-    assert "No views are shown: pruned.ply was changed since." in result.stdout
+    report = run_json("report", out, "--data", data)
+    said = "pruned.ply was written again since: its figures are of the file before."
+    assert report["notes"] == [said, "No views are shown: pruned.ply was changed since."]
+    assert said in (out / "report.html").read_text()
+
+
+def test_a_result_of_run_that_was_written_over_is_told_of_too(finetuned, tmp_path):
+    model = shutil.copy(finetuned[0] / "model.ply", tmp_path / "model.ply")
+    data = {**finetuned[1], "model_after": str(model)}
+    records.leave(model, "run", {key: each for key, each in data.items() if key != "out"})
+    assert run_json("report", tmp_path)["notes"] == []
+    fp.save(model, replace(load(model), opacity=load(model).opacity - 1))
+    (said,) = run_json("report", tmp_path)["notes"]
+    assert "model.ply was written again since" in said
 
 
 def test_what_a_fine_tuning_leaves_names_no_folder_of_the_machine(finetuned, out, data, tmp_path):

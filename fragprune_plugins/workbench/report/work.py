@@ -59,7 +59,7 @@ def report(*, folder: Path, out: Path | None, data: Path | None, engine: EngineO
         pictures = Path(name)
         drawn, learning, missing = _draw(main, folder, pictures, data, partial(open_engine, engine))
         more = [*learning, *_files(every, folder, pictures)]
-        notes = [*_begun(main), _ONLY_CONTROLS if control else "", missing]
+        notes = [*_begun(main), *map(_outdated, every), _ONLY_CONTROLS if control else "", missing]
         notes = [note for note in notes if note]
         text = report_page.compose(
             report_page.TEMPLATE,
@@ -284,17 +284,19 @@ def _draw(
         if data is not None:  # the user asked for the views
             raise
         return None, learning, f"No views are shown: {error}"
-    if _rewritten(record, loaded[-1]):
+    if _outdated(record):
         return None, learning, f"No views are shown: {source.models[-1].name} was changed since."
     before, after = (Candidate(each, source.drawing) for each in loaded)
     return report_page.draw_views(folder, before, after, dataset.test, engine), learning, ""
 
 
-def _rewritten(record: Record, after: Model) -> bool:
-    """Whether a model has lost Gaussians or cutoffs since, as in an editor."""
-    figures = record.data.get("after") or {}
-    lost = bool(record.data.get("untruncated")) and not after.pruned
-    return lost or figures.get("gaussians", len(after)) != len(after)
+def _outdated(record: Record) -> str:
+    """A line for a result that was written over since its figures were taken; "" else."""
+    name = Path(str(record.data.get("model_after") or record.data.get("out"))).name
+    result = record.path.parent / name
+    if not (record.sha256 and result.is_file()) or records.beside(result):
+        return ""
+    return f"{name} was written again since: its figures are of the file before."
 
 
 def _files(every: list[Record], inside: Path, folder: Path) -> list[tuple[str, str]]:
