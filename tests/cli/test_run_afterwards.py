@@ -12,6 +12,7 @@ from finetune import tiny
 from miniatures.runs import TINY, edit
 from miniatures.vanilla_3dgs import HOST
 
+from fragprune_plugins.files.atomic import locked
 from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.workbench.commands import cli
@@ -81,6 +82,12 @@ def test_it_trains_as_it_is_and_its_model_learns_after(host, photographs, tmp_pa
     assert read_ply(folder / "control.ply").falloff is None
     again = run_json("run", "--stage", "finetune", "--again", *WORDS, *words)
     assert again["control"] == zero["after"]
+
+
+def test_two_trainings_into_one_folder_at_once_are_refused(host, photographs, tmp_path, capfd):
+    with locked(tmp_path / "out", wait=0, what="run"):
+        fails("run", *WORDS, *host(photographs), says=("out: ", "another process"), code=1)
+    assert "trained as it is" not in capfd.readouterr().err
 
 
 def test_a_model_unlike_its_photographs_learns_from_itself(host, photographs, tmp_path, trained):

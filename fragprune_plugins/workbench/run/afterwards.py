@@ -7,7 +7,10 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import click
+
 from fragprune_plugins.errors import DatasetError, UsageError, log
+from fragprune_plugins.files.atomic import locked
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.learning.schedule import QUICK_ITERATIONS, Settings
 from fragprune_plugins.workbench.commands.command import Report
@@ -46,6 +49,9 @@ def train_then_finetune(
         read_scene(photographs.folder, photographs.images)
     if stage == "auto":
         since = time.time() - 1  # file systems round
+        if host.output is not None:
+            lock = locked(host.output.resolve(), wait=0, what="run")
+            click.get_current_context().with_resource(lock)
         log.info("it trains as it is, by itself")
         host.train(quietly=json)
     elif host.output is None:
