@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from fragprune_plugins.constants import VERSION
 from fragprune_plugins.engines.cuda.kernels import cache_folder, digest_of_sources
-from fragprune_plugins.errors import EngineError, InputError, ProofError, log
+from fragprune_plugins.errors import EngineError, InputError, OutputError, ProofError, log
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.hosts.dialect import HostCall, Place, Proof, Prover
 from fragprune_plugins.hosts.seams import SeamCall
@@ -153,10 +153,8 @@ def file_of(rasterizer: str, call: str) -> Path:
 
 def keep(proof: Proof, file: Path) -> None:
     """Keep a proof for later runs on this machine. A folder that cannot be written keeps none."""
-    with suppress(OSError):
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(file) as target:
-            target.write_text(json.dumps(asdict(proof)))
+    with suppress(OutputError), replacing(file) as target:
+        target.write_text(json.dumps(asdict(proof)))
 
 
 def read(file: Path) -> Proof | None:

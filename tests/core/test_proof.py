@@ -18,7 +18,8 @@ from fragprune_graphdeco.proof import RasterizerProver
 from fragprune_plugins import Pressure, Settings
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import EngineError, ProofError
-from fragprune_plugins.injection import rasterizing
+from fragprune_plugins.hosts.dialect import Proof
+from fragprune_plugins.injection import proofs, rasterizing
 from fragprune_plugins.testing.invariants.case import FixedThresholds, open_all
 from fragprune_vanilla_3dgs import Vanilla3DGS
 from reference_renderer.covariance import rotation_matrices
@@ -305,6 +306,12 @@ def test_a_proof_is_kept_until_the_rasterizer_or_what_proves_it_changes(host, ma
     monkeypatch.setattr(proof, "_OWN", "mended")
     draw(folder)
     assert len(made) == 3
+
+
+def test_a_proof_that_cannot_be_written_is_not_kept(tmp_path):
+    (tmp_path / "proof.json" / "in the way").mkdir(parents=True)
+    proofs.keep(Proof("a call", ("the picture",)), tmp_path / "proof.json")
+    assert proofs.read(tmp_path / "proof.json") is None
 
 
 def test_a_failed_proof_is_kept_and_not_repeated(host, made):
