@@ -189,9 +189,8 @@ class View:
     __repr__ = one_line
 
     def __post_init__(self) -> None:
-        if self.width < 1 or self.height < 1:
-            found = f"{self.width}x{self.height} pixels"
-            raise InputError("View", found, "at least 1x1", "Check the camera.")
+        least = "at least 1 pixel"
+        check_values(self, width=(self.width > 0, least), height=(self.height > 0, least))
         check_fields(self, viewmatrix=(4, 4), projmatrix=(4, 4), campos=(3,), background=(3,))
 
     def to(self, device: torch.device | str) -> View:

@@ -146,12 +146,9 @@ class HostRepo:
 
     def place(self, module: str, attribute: str) -> str:
         """The file:line of a definition, or of the existing part of its path if it is absent."""
-        scope: ast.AST | None = self.tree(module)
-        line = 1
-        for name in attribute.split("."):
-            scope = _definition(scope, name)
-            line = getattr(scope, "lineno", line)
-        return self.at(module, line)
+        names = attribute.split(".")
+        parts = (self.definition(module, ".".join(names[:end])) for end in range(1, len(names) + 1))
+        return self.at(module, max(getattr(part, "lineno", 1) for part in parts))
 
     def at(self, module: str, line: int) -> str:
         """A line of a module as file:line, the file relative to the checkout."""

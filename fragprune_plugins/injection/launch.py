@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import tempfile
 import time
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 
 from fragprune_plugins.errors import UsageError, log
-from fragprune_plugins.files import atomic, sidecar
+from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.atomic import locked, replacing
 from fragprune_plugins.hosts import preflight
 from fragprune_plugins.hosts.adapter import HostAdapter, ScriptAdapter
 from fragprune_plugins.hosts.choosing import choose, locate, usage
@@ -63,15 +64,14 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
     started = time.perf_counter()
     trains = _expect_trainable(host, repo, trainer, options, device)
     own = "run" if options.stage == "auto" or options.settings.goal.presses else "control"
-    folder = host.output.resolve() if trains and host.output else None
-    alone = atomic.locked(folder, 0, own) if folder else contextlib.nullcontext()
+    alone = locked(host.output.resolve(), 0, own) if trains and host.output else nullcontext()
     with tempfile.TemporaryDirectory(prefix="fragprune-") as scratch, alone:
         stages = Stages(host, repo, trainer, plugins, options, device, Path(scratch))
         named = {"off": stages.observe, "joint": stages.joint, "finetune": stages.finetune}
         named.get(options.stage if trains else "off", stages.train_then_finetune)()
         own = str(host.flags.config or "") if host.line.config else ""
         for kept in stages.output.glob("cfg_args") if own and stages.output else ():
-            with atomic.replacing(kept) as new:
+            with replacing(kept) as new:
                 new.write_text(kept.read_text().replace(f"{scratch}/{Path(own).name}", own))
     return stages.summary(time.perf_counter() - started)
 

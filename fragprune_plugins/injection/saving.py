@@ -43,11 +43,7 @@ def on_save(session: SessionState, call: SeamCall) -> Any:
 
 
 def learner(session: SessionState, call: SeamCall) -> tuple[Any, ModelState | None]:
-    """Of a model that is saved, or else of the one that it is an exact copy of, what is known.
-
-    Raises:
-        DivergedError: it learns, and has NaN or infinity.
-    """
+    """The model that is saved, or that of which it is an exact copy; DivergedError if it is NaN."""
     model = call.model
     if session.models and model not in session.models:
         of = session.adapter.means, session.adapter.opacities

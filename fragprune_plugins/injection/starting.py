@@ -65,17 +65,16 @@ def find(adapter: ScriptAdapter, host: HostCommand, output: Path | None) -> Star
     where, flag = output or "no output folder", host.line.spellings("resume")[-1]
     saved, newer = files(adapter, output), 0
     while saved and _learned(saved[-1][1]):
-        at, path = saved.pop()
+        at, _ = saved.pop()
         newer += 1
-        if at == host.iterations:
-            found, expected = f"{path}, which learned within its training", "one that did not"
-            remedy = f"To go on from it, or to start from another, name it with {flag}."
-            raise UsageError("--stage finetune", found, expected, remedy)
+        if at == host.iterations:  # learned within its training, from which others are, or older
+            saved = []
     if not saved:
         found, expected = "no model", f"{flag} FILE, or {host.line.output[-1]} DIR of a training"
         remedy = "Add one of these flags to the host's command."
         if newer:
-            found, expected = "only results of stage 2 or of a control", "one of a training"
+            found = "only results of stage 2 or of a control, or a joint training's and older files"
+            expected = "one of a training"
             remedy = f"To continue from one of these files, name it with {flag}."
         raise UsageError("--stage finetune", f"{found} in {where}", expected, remedy)
     iteration, path = saved[-1]

@@ -56,14 +56,12 @@ def can_be_fused(optimizer: Any, group: dict[str, Any]) -> bool:
     for parameter in group["params"]:
         state = optimizer.state.get(parameter, {})
         tensors += [parameter, parameter.grad, *(state[name] for name in state)]
-    return all(_is_plain(each) for each in tensors if each is not None)
-
-
-def _is_plain(value: Any) -> bool:
-    return (
-        isinstance(value, Tensor)
-        and value.layout is torch.strided
-        and value.device.type == "cpu"
-        and value.dtype == torch.float32
-        and value.is_contiguous()
+    return all(
+        isinstance(each, Tensor)
+        and each.layout is torch.strided
+        and each.device.type == "cpu"
+        and each.dtype == torch.float32
+        and each.is_contiguous()
+        for each in tensors
+        if each is not None
     )

@@ -119,9 +119,8 @@ def test_after_a_joint_training_no_older_file_is_taken_in_its_place(
     words = command(photographs, folder, 10, "--save_iterations", 4)
     run(words, replace(OPTIONS, stage="joint", from_iter=6))
     assert sidecar.belongs(folder / ply(10))
-    with pytest.raises(UsageError, match="learned within its training") as error:
+    with pytest.raises(UsageError, match=f"a joint training's and older files in {folder}"):
         started(folder, 10)
-    assert str(folder / ply(10)) in error.value.found
     line = started(folder, 10, "--start_checkpoint", folder / ply(10))
     assert f"{folder / ply(10)}: the command names it" in line
 
