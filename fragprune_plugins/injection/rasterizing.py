@@ -14,7 +14,7 @@ from torch import Tensor
 
 from fragprune_plugins.constants import NEUTRAL_LOGIT
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.errors import AlignmentError, SessionError, UsageError, log
+from fragprune_plugins.errors import AlignmentError, PluginError, SessionError, UsageError, log
 from fragprune_plugins.hosts.dialect import HostCall
 from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
 from fragprune_plugins.injection.proofs import proved
@@ -28,9 +28,10 @@ from fragprune_plugins.injection.stepping import (
 from fragprune_plugins.learning.area import area_per_pixel
 from fragprune_plugins.learning.goals import Fewer
 from fragprune_plugins.plugins.hooks import thresholds_for
-from fragprune_plugins.types import RasterInputs, RasterOutputs
+from fragprune_plugins.types import RasterInputs, RasterOutputs, short
 
 _AMP = "torch.amp" if hasattr(torch.amp, "GradScaler") else "torch.cuda.amp"  # before torch 2.3
+Draw = Callable[[RasterInputs, Tensor | None], RasterOutputs]
 SCALER = Seam(Role.LOSS, f"{_AMP}.grad_scaler", "GradScaler.scale", ("outputs",), external=True)
 
 
@@ -148,7 +149,7 @@ def on_rasterize(session: SessionState, call: SeamCall) -> Any:
     if not state.store.cuts and not presses:
         return by_host()
     with directly(means.device):
-        inputs, engine = unpack(session, drawn)
+        inputs, by_ours = unpack(session, drawn)
         inputs = replace(inputs, **state.store.rules)
         if stage is None:
             thresholds = thresholds_for(inputs, state.store, session.plugins)
@@ -161,7 +162,7 @@ def on_rasterize(session: SessionState, call: SeamCall) -> Any:
 
             def truncated(each: RasterInputs, part: int = 0) -> RasterOutputs:
                 picture = (view[part], 0) if isinstance(view, tuple) else (view, part)
-                return rasterize(engine, state, picture, thresholds, each)
+                return rasterize(by_ours, state, picture, thresholds, each)
 
             return answer(drawn, inputs, truncated)
     return by_host()
@@ -211,8 +212,8 @@ def proved_answer(
 def draw(session: SessionState, call: HostCall) -> Any:
     """Draw a call without thresholds, by our engine."""
     with directly(call[session.dialect.means].device):
-        inputs, engine = unpack(session, call)
-        return session.dialect.answer(call, inputs, lambda each, _=0: engine.rasterize(each, None))
+        inputs, drawn = unpack(session, call)
+        return session.dialect.answer(call, inputs, lambda each, _=0: drawn(each, None))
 
 
 @contextmanager
@@ -226,15 +227,26 @@ def directly(device: torch.device) -> Iterator[None]:
         yield
 
 
-def unpack(session: SessionState, call: HostCall) -> tuple[RasterInputs, Engine]:
-    """Translate the host's call into ``RasterInputs``, and choose the engine for its device."""
+def unpack(session: SessionState, call: HostCall) -> tuple[RasterInputs, Draw]:
+    """Translate the host's call into ``RasterInputs``, and choose what draws on its device."""
     engine, rendering = session.engine(call[session.dialect.means].device), session.rendering.get()
     still = rendering is not None and session.standing_still(rendering[0])
-    return session.dialect.unpack(replace(call, engine=engine, still=still)), engine
+    inputs = session.dialect.unpack(replace(call, engine=engine, still=still))
+    return inputs, partial(drawn_by, engine)
+
+
+def drawn_by(engine: Engine, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
+    """What an engine draws; raises PluginError if it is no picture."""
+    outputs = engine.rasterize(inputs, thresholds)
+    if not isinstance(outputs, RasterOutputs):
+        where = f"engine {engine.name} of {type(engine).__module__}"
+        remedy = "Fix or uninstall that plugin, or choose another --engine."
+        raise PluginError(where, short(outputs), "RasterOutputs", remedy)
+    return outputs
 
 
 def rasterize(
-    engine: Engine,
+    draw: Draw,
     state: ModelState,
     picture: tuple[Hashable, int],
     thresholds: Tensor | None,
@@ -242,16 +254,16 @@ def rasterize(
 ) -> RasterOutputs:
     """Draw with thresholds (N,) or without; while learning, add the pressure to the loss."""
     if further_picture(state, picture) or state.stage is None or state.beside:
-        return engine.rasterize(inputs, covering(thresholds, inputs))
+        return draw(inputs, covering(thresholds, inputs))
     shown = state.stage.dropped(inputs)
     if thresholds is not None:
         thresholds = thresholds.view_as(thresholds)  # of this picture alone, for its hook
-    outputs = engine.rasterize(shown, thresholds)
+    outputs = draw(shown, thresholds)
 
     def untruncated() -> RasterOutputs:
         if thresholds is None and inputs.stop is None and shown is inputs:
             return outputs
-        return engine.rasterize(replace(inputs, stop=None), None)
+        return draw(replace(inputs, stop=None), None)
 
     area = area_per_pixel(inputs) if state.stage.settings.goal.on_area else None
     pressure = state.stage.on_drawn(picture[0], outputs, untruncated, picture[1], area)

@@ -43,7 +43,7 @@ def engine_for(
     engine = plugins.engines.get((name, device))
     if engine is None:
         hook = hookspecs.fragprune_create_engine
-        engine = plugins.ask(hook, _no_engine, name=name, device=device)
+        engine = plugins.ask(hook, _no_engine, f"engine {name}", name=name, device=device)
         if engine is None and name in ("auto", *ENGINES):
             engine = create_engine(name, device)
         elif engine is None:

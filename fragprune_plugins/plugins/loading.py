@@ -129,21 +129,28 @@ class Plugins:
         self._manager.unregister(name=name)
         self._off = {each for each in self._off if each[0] != name}
 
-    def ask(self, hook: Hook, wrong: Callable[[Any], Wrong | None], **given: Any) -> Any:
+    def ask(
+        self, hook: Hook, wrong: Callable[[Any], Wrong | None], one: str = "", **given: Any
+    ) -> Any:
         """Ask a hook; returns the first answer that is not None, or None if no plugin answers.
 
         Args:
             wrong: returns what is wrong with an answer, or None.
+            one: what only one plugin should have; a warning names the others.
 
         Raises:
             PluginError: a plugin raised, or its answer is wrong.
         """
+        found: dict[str, Any] = {}
         for each in self._implementations(hook):
-            if (answer := _call(each, hook, given)) is not None:
+            if (one or not found) and (answer := _call(each, hook, given)) is not None:
                 if complaint := wrong(answer):
                     raise _broken(each.plugin_name, hook.__name__, *complaint)
-                return answer
-        return None
+                found[each.plugin_name] = answer
+        if len(found) > 1:
+            said = "%s: of plugins %s the first has it. Set FRAGPRUNE_BLOCK to all but one."
+            log.warning(said, one, ", ".join(found))
+        return next(iter(found.values()), None)
 
     def tell(self, hook: Hook, **given: Any) -> None:
         """Call every observer. An observer that raises is reported and not called again."""

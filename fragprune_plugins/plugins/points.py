@@ -5,11 +5,13 @@ A package offers an object by a line in its ``pyproject.toml``, and it is import
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from fragprune_plugins.errors import PluginError, log, printable
+from fragprune_plugins.errors import FragpruneError, PluginError, log, printable
 
 
 def _owner(point: EntryPoint) -> str:
@@ -42,14 +44,24 @@ def load(point: EntryPoint, kind: type | tuple[type, ...] = object) -> Any:
         point: of ``offered``.
         kind: what it must be an instance of.
     """
-    owner = _owner(point)
-    try:
+    with blaming(point):
         loaded = point.load()
         if not isinstance(loaded, kind):
             raise TypeError(f"{point.value} is a {type(loaded).__name__}")
+    return loaded
+
+
+@contextlib.contextmanager
+def blaming(point: EntryPoint, *passing: type[Exception]) -> Iterator[None]:
+    """State what code of an entry point raises, and whose it is. Errors of ours pass, and these."""
+    ours: tuple[type[Exception], ...] = (FragpruneError, *passing)
+    try:
+        yield
+    except ours:
+        raise
     except (Exception, SystemExit) as error:
+        owner = _owner(point)
         found = printable(f"{type(error).__name__}: {error}".split("\n", 1)[0])
         expected = f"an object that {owner} offers"
         remedy = f"Update or uninstall {owner}."
         raise PluginError(f"{point.group} {point.name}", found, expected, remedy) from error
-    return loaded

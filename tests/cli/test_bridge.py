@@ -1,8 +1,10 @@
 """fragprune bridge: JavaScript modules for web viewers."""
 
 import json
+import sys
 from importlib.metadata import EntryPoint
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from cli.commands import fails, run, run_json
@@ -45,8 +47,11 @@ def test_a_folder_that_cannot_be_made_is_a_stated_error(tmp_path):
     fails(*asked, says=str(tmp_path / "taken"), code=1)
 
 
-@pytest.mark.parametrize("module", ["no.such.package", "json", "sys:exit"])
+@pytest.mark.parametrize("module", ["no.such.package", "json", "sys:exit", "bridge_of_3"])
 def test_a_broken_bridge_is_named(monkeypatch, module):
+    numbered = ModuleType("bridge_of_3")
+    numbered.MODULE = 3
+    monkeypatch.setitem(sys.modules, "bridge_of_3", numbered)
     broken = EntryPoint("mine", module, bridge.GROUP)
     monkeypatch.setattr(bridge, "offered", lambda group: {"mine": broken})
     for words in ((), ("mine",)):

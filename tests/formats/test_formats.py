@@ -5,6 +5,7 @@ import math
 import struct
 import zipfile
 from dataclasses import replace
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -16,7 +17,7 @@ from formats.scenes import apart, random_splat, splats
 from hypothesis import given, settings
 
 from fragprune_plugins import ThresholdStore, load, load_dataset, measure, save
-from fragprune_plugins.errors import FragpruneError, ModelFileError, OutputError
+from fragprune_plugins.errors import FragpruneError, ModelFileError, OutputError, PluginError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.workbench.models import cutoffs, formats
@@ -292,6 +293,27 @@ def test_every_suffix_has_a_format_and_others_none():
         assert formats.named(Path(f"a{suffix.upper()}")).suffix == suffix
     with pytest.raises(OutputError):
         formats.named(Path("a.obj"))
+
+
+def raising(*_):
+    raise KeyError("colours")
+
+
+@pytest.mark.parametrize("fault", ["write", "claims"])
+def test_a_plugins_format_that_fails_is_named(fault, tmp_path, monkeypatch):
+    path, known = tmp_path / "a.mine.ply", formats.of_suffix(".spz")
+    point = EntryPoint("mine.ply", "a_module", formats.GROUP)
+    broken = replace(known, **{fault: raising})
+    monkeypatch.setattr(formats, "offered", lambda group: {"mine.ply": point})
+    monkeypatch.setattr(formats, "SUFFIXES", (".ply", ".mine.ply"))
+    monkeypatch.setattr(EntryPoint, "load", lambda point: broken)
+    formats.of_suffix.cache_clear()
+    try:
+        with pytest.raises(PluginError, match=r"mine\.ply: KeyError: 'colours'.*a_module"):
+            save(path, random_splat(5, 1, 0)) if fault == "write" else load(path)
+    finally:
+        monkeypatch.undo()
+        formats.of_suffix.cache_clear()
 
 
 @pytest.mark.parametrize("suffix", formats.SUFFIXES)

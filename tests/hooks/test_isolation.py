@@ -120,6 +120,44 @@ def test_an_answer_that_cannot_be_used_is_refused(hook, answer, words):
         ASK[hook](with_one(hook, lambda: answer))
 
 
+class Mine:
+    """A plugin, and its engine, which draws nothing that can be used."""
+
+    name = "mine"
+
+    def __init__(self, answer=None):
+        self.answer = answer
+
+    @hookimpl
+    def fragprune_create_engine(self, name, device):
+        return self if name == "mine" else None
+
+    def rasterize(self, inputs, thresholds):
+        return self.answer
+
+
+@pytest.mark.parametrize(("answer", "said"), [(None, "None"), (0.5, "0.5")])
+def test_an_engine_that_gives_no_outputs_is_named(answer, said):
+    named = f"engine mine of {Mine.__module__}: {said}; expected RasterOutputs"
+    with joint(plugins=[Mine(answer)], engine="mine") as host:
+        model = host.model()
+        with pytest.raises(PluginError, match=named):
+            host.render(host.camera(), model)
+
+
+def test_of_two_engines_of_one_name_the_one_that_draws_is_told(caplog):
+    plugins, first, last = Plugins(), Mine(), Mine()
+    plugins.register(first, "first")
+    assert engine_for("mine", "cpu", plugins) is first
+    assert caplog.messages == []
+    plugins.engines.clear()
+    plugins.register(last, "last")
+    assert engine_for("mine", "cpu", plugins) is last
+    (said,) = caplog.messages
+    assert "engine mine: of plugins last, first the first" in said
+    assert "FRAGPRUNE_BLOCK" in said
+
+
 def test_an_adapter_that_raises_while_it_reads_a_host_does_not_fit_and_stops_no_other():
     class Broken(Vanilla3DGS):
         name = "broken"

@@ -57,7 +57,7 @@ def command(viewer: str | None, out: Path | None) -> Report:
 
 def _module(point: EntryPoint) -> Path:
     """The module of an installed bridge."""
-    path = Path(getattr(load(point, ModuleType), "MODULE", "MODULE"))
+    path = Path(str(getattr(load(point, ModuleType), "MODULE", "MODULE")))
     if not path.is_file():
         expected = "a package with the path of its JavaScript module as MODULE"
         remedy = f"Install {point.value} again, or remove it."

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 from fragprune_plugins.errors import ModelFileError, OutputError, PluginError
 from fragprune_plugins.files.reading import Reading, UntrustedFile
-from fragprune_plugins.plugins.points import load, offered
+from fragprune_plugins.plugins.points import blaming, load, offered
 
 if TYPE_CHECKING:
     from fragprune_plugins.files.model import Model
@@ -80,8 +80,11 @@ def of_suffix(suffix: str) -> Format:
     """The format with one of ``SUFFIXES``; PluginError if its package cannot be loaded."""
     if suffix == PLY.suffix:
         return PLY
-    form: Format = load(offered(GROUP)[suffix.removeprefix(".")], Format)
-    return form
+    point = offered(GROUP)[suffix.removeprefix(".")]
+    form: Format = load(point, Format)
+    # Of what ``read`` raises a file may be the cause; it is stated there.
+    write = blaming(point, ValueError, OSError, MemoryError)(form.write)
+    return replace(form, write=write, claims=blaming(point)(form.claims))
 
 
 def named(path: Path) -> Format:
