@@ -4,6 +4,7 @@ import csv
 import io
 import logging
 import sys
+from importlib.metadata import EntryPoint
 from types import SimpleNamespace
 
 import pytest
@@ -13,7 +14,7 @@ from click.shell_completion import ShellComplete
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.plugins.hookspecs import fragprune_step
 from fragprune_plugins.plugins.loading import Plugins, installed
-from fragprune_plugins.workbench.commands import cli
+from fragprune_plugins.workbench.commands import cli, logs
 from fragprune_plugins.workbench.commands.logs import (
     COLUMNS,
     Bar,
@@ -63,13 +64,27 @@ def test_finetune_writes_a_row_a_step(words, tmp_path):
     assert installed().answering(fragprune_step) == []  # nobody is left behind
 
 
-def test_a_new_run_begins_the_file_anew_and_a_resumed_one_appends(tmp_path):
+@pytest.mark.parametrize(
+    ("runs", "left", "told"),
+    [
+        ([(1, 2, 3), (1, 2)], [1, 2], "has rows of an earlier run: 0 stay, 3 go"),
+        ([(1, 2), (3, 4)], [1, 2, 3, 4], "2 stay, 0 go"),  # it was killed, and goes on
+        ([(1, 2, 3), (3, 4)], [1, 2, 3, 4], "2 stay, 1 go"),  # from a step before
+        ([(7, 8), (7, 8, 9)], [7, 8, 9], "0 stay, 2 go"),  # learned within a training
+    ],
+)
+def test_a_new_run_begins_the_file_anew_and_a_resumed_one_appends(
+    tmp_path, caplog, runs, left, told
+):
     log = tmp_path / "steps.csv"
-    for steps in ((1, 2, 3), (1, 2), (3, 4)):
+    for steps in runs:
         plugins = Plugins()
         with logging_steps([CsvLog(str(log))], plugins):
             tell(plugins, steps)
-    assert [int(row["step"]) for row in rows(log)] == [1, 2, 3, 4]
+    assert [int(row["step"]) for row in rows(log)] == left
+    (said,) = caplog.messages
+    assert str(log) in said
+    assert told in said
 
 
 def test_a_file_can_be_followed_while_it_grows(tmp_path):
@@ -113,6 +128,12 @@ def test_wandb_gets_every_step(monkeypatch):
 def test_a_missing_library_is_a_usage_error_that_says_what_to_install(words, out, monkeypatch):
     monkeypatch.setitem(sys.modules, "wandb", None)
     fails(*words, 6, "--log", "wandb:x", says="fragprune-plugins[wandb]")
+    assert not out.exists()
+
+
+def test_a_plugins_log_that_cannot_be_opened_is_named(words, out, monkeypatch):
+    monkeypatch.setattr(logs, "offered", lambda _: {"mine": EntryPoint("mine", "array:array", "g")})
+    fails(*words, 6, "--log", "mine:x", says="[plugin] g mine: ValueError", code=1)
     assert not out.exists()
 
 

@@ -22,7 +22,7 @@ from fragprune_plugins.errors import log as told
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.plugins.loading import Plugins, installed
-from fragprune_plugins.plugins.points import load, offered
+from fragprune_plugins.plugins.points import blaming, load, offered
 from fragprune_plugins.workbench.commands.options import Function
 from fragprune_plugins.workbench.ranks import launched
 
@@ -44,7 +44,9 @@ class Log(Protocol):
 
 
 class CsvLog:
-    """A row a step. A fine-tuning that goes on after a kill appends; another one begins anew.
+    """A row a step. Rows of earlier steps stay: a fine-tuning that was killed goes on after them.
+
+    All others are another run's, or what the kill has lost, and go.
 
     Raises:
         OutputError: it cannot be written, or holds something else than a log.
@@ -68,15 +70,24 @@ class CsvLog:
         with open(self._path, "rb") as file:
             return file.read(len(begin)) in (b"", begin)
 
+    def _begin(self, first: int) -> None:
+        """Write the heads of the columns, and again the rows that stay."""
+        self._begun = True
+        before = self._path.read_text("utf-8", "replace") if self._path.is_file() else ""
+        rows = [row.split(",") for row in before.splitlines()[1:]]
+        whole = (row for row in rows if row[0].isdecimal() and len(row) == len(COLUMNS))
+        kept = [row for row in whole if int(row[0]) < first]
+        if rows:
+            said = "%s has rows of an earlier run: %d stay, %d go"
+            told.warning(said, self._path, len(kept), len(rows) - len(kept))
+        if before:
+            self._file.truncate(0)
+        self._rows.writerows([COLUMNS, *kept])
+
     def write(self, stats: StepStats) -> None:
-        """Append a row; the first step of all begins the file."""
+        """Append a row."""
         if not self._begun:
-            self._begun = True
-            if stats.step == 1:
-                self._file.seek(0)
-                self._file.truncate()
-            if self._file.tell() == 0:
-                self._rows.writerow(COLUMNS)
+            self._begin(stats.step)
         self._rows.writerow(asdict(stats).values())
         self._file.flush()  # whoever follows the file sees the step
 
@@ -214,6 +225,12 @@ def _places(
     return places
 
 
+def _opened(kind: EntryPoint, place: str) -> Log:
+    with blaming(kind):
+        log: Log = load(kind, type)(place)
+    return log
+
+
 def log_option(function: Function) -> Function:
     """The option ``--log``: the steps that the command takes are written there."""
 
@@ -230,7 +247,7 @@ def log_option(function: Function) -> Function:
     def logged(*args: Any, logs: list[tuple[EntryPoint, str]], **kwargs: Any) -> Any:
         if not logs or not launched().first:
             return function(*args, **kwargs)
-        with logging_steps([load(kind, type)(place) for kind, place in logs]):
+        with logging_steps([_opened(kind, place) for kind, place in logs]):
             return function(*args, **kwargs)
 
     return logged  # type: ignore[return-value]
