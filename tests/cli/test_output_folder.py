@@ -41,6 +41,22 @@ def test_commands_take_the_newest_model_and_the_trainings_cameras(output, tmp_pa
         assert picture.size == (tiny.SIDE, tiny.SIDE)
 
 
+@pytest.mark.parametrize(
+    ("trained", "more", "side"),
+    [(2, (), 16), (2, ("--resolution", 1), 32), (-1, (), 32), (20, (), 20)],
+)
+def test_pictures_are_drawn_at_the_size_that_the_training_had(
+    data, model, tmp_path, trained, more, side
+):
+    """cameras.json has that of the photographs, whatever -r said."""
+    output = tiny.host_output(tmp_path / "out", data, model, resolution=trained)
+    result = succeeds("render", output, "--out", tmp_path / "pictures", *more)
+    for each in (tmp_path / "pictures").iterdir():
+        with Image.open(each) as picture:
+            assert picture.size == (side, side)
+    assert ("--resolution 1" in result.stderr) == (side < tiny.SIDE)
+
+
 def test_a_folder_with_one_output_folder_is_that(output, tmp_path):
     """As a demo's: the model lies in model/."""
     assert newest_model(tmp_path) == newest_model(output)

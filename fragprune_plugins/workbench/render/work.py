@@ -8,12 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import click
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files.model import Model
+from fragprune_plugins.hosts.photographs import Resolution
 from fragprune_plugins.workbench.commands import opening
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.options import (
@@ -31,7 +33,7 @@ from fragprune_plugins.workbench.render import filming
 from fragprune_plugins.workbench.scenes.cameras import divided, load_cameras
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
 from fragprune_plugins.workbench.scenes.generated import Named
-from fragprune_plugins.workbench.scenes.output import cameras_of
+from fragprune_plugins.workbench.scenes.output import cameras_of, trained_size
 
 FPS = 30
 """Frames a second of a film."""
@@ -58,7 +60,10 @@ def render(
     """Do what ``fragprune render`` promises; its options are the arguments."""
     film = out.suffix.lower() == ".mp4"
     _expect_place(out, film=film, shard=shard)
+    size: int | Resolution = scene.resolution
     if scene.data is None and not orbit:
+        if cameras is None and "resolution" not in scene.given:
+            size = trained_size(model)
         cameras = _expect_cameras(cameras or cameras_of(model))
     rasterizer, device = opening.open_engine(engine)
     writable_folder(out.parent if film else out)
@@ -69,7 +74,7 @@ def render(
         dataset = load_photographs(opening.photographs_for(model, scene))
         named = [(shot.name, shot.view) for shot in opening.chosen(dataset, views)]
     else:
-        named = _views(whole, cameras, opening.over_its_background(model, scene), up)
+        named = _views(whole, cameras, size, opening.over_its_background(model, scene), up)
     if film and not orbit:
         named = filming.along(named, max(FRAMES, len(named)))
     with joined(device) if shard else nullcontext(Ranks()) as ranks:
@@ -148,13 +153,21 @@ def _expect_cameras(cameras: Path | None) -> Path:
 
 
 def _views(
-    whole: Model, cameras: Path | None, scene: SceneOptions, up: tuple[float, float, float]
+    whole: Model,
+    cameras: Path | None,
+    size: int | Resolution,
+    scene: SceneOptions,
+    up: tuple[float, float, float],
 ) -> Named:
-    """The named views of a file, or without one those of an orbit."""
+    """The named views of a file, or without one those of an orbit; of this size."""
     if cameras is not None:
         named = load_cameras(cameras, white_background=scene.white_background)
     else:
         background = torch.full((3,), float(scene.white_background))
         orbit = filming.orbit(whole, FRAMES, up)
         named = [(name, replace(view, background=background)) for name, view in orbit]
-    return divided(named, scene.resolution)
+    sized = divided(named, size)
+    if isinstance(size, Resolution) and sized[0][1].width != (full := named[0][1].width):
+        said = f"{sized[0][1].width} pixels wide, as in its training; --resolution 1 draws {full}"
+        click.echo(said, err=True)
+    return sized

@@ -81,9 +81,9 @@ def load_scene_cameras(
     return train, test
 
 
-def divided(views: list[tuple[str, View]], by: int) -> list[tuple[str, View]]:
+def divided(views: list[tuple[str, View]], by: int | Resolution) -> list[tuple[str, View]]:
     """The same views with both sides of their pictures divided, rounded as photographs are."""
-    size = Resolution(divide=by)
+    size = Resolution(divide=by) if isinstance(by, int) else by
     sizes = [size.of(view.width, view.height) for _, view in views]
     return [
         (name, replace(view, width=width, height=height))

@@ -107,6 +107,12 @@ def over_white(model: Path) -> bool:
     return bool(known and known[0].white_background)
 
 
+def trained_size(model: Path) -> Resolution:
+    """The size at which the training of a model read its photographs, as far as is known."""
+    known = _legible(model)
+    return known[0].resolution if known else Resolution()
+
+
 def _legible(model: Path) -> tuple[Photographs, bool] | None:
     """What ``_arguments`` gives; None also where they cannot be read."""
     with contextlib.suppress(DatasetError):
