@@ -160,15 +160,16 @@ def current_gpu(device: str) -> Iterator[None]:
 
 
 def knowing_numpy() -> contextlib.AbstractContextManager[None]:
-    """Inside, torch's safe loader takes NumPy's scalars; before torch 2.5 it cannot be told to."""
+    """Inside, torch's safe loader takes NumPy's numbers; before torch 2.5 it cannot be told to."""
     telling = getattr(torch.serialization, "safe_globals", None)
     return telling(checkpoint_values()) if telling else contextlib.nullcontext()
 
 
 def checkpoint_values() -> list[Any]:
-    """What torch's safe loader does not know of what hosts save: NumPy scalars."""
-    scalar: Any = np.float64(0).__reduce__()[0]
-    return [scalar, np.dtype, *(type(np.dtype(kind)) for kind in ("f4", "f8", "i4", "i8"))]
+    """What torch's safe loader does not know of what hosts save: NumPy's scalars and arrays."""
+    made: list[Any] = [each.__reduce__()[0] for each in (np.float64(0), np.zeros(0))]
+    kinds = (type(np.dtype(kind)) for kind in ("f4", "f8", "i4", "i8", "u1", "?"))
+    return [*made, np.ndarray, np.dtype, *kinds]
 
 
 def _refuse_to_start_again(program: str, arguments: list[str]) -> NoReturn:

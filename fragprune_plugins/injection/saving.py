@@ -165,7 +165,7 @@ def brought(capture: Any, device: torch.device) -> Any:
     """
     if device.type == "cpu" or any(each.device == device for each in tensors_of(capture)):
         return capture
-    return changed(capture, lambda own: own.to(device) if own.ndim else own)
+    return changed(capture, lambda it: it.to(device) if torch.is_tensor(it) and it.ndim else it)
 
 
 def tensors_of(held: Any) -> Iterator[Tensor]:
@@ -177,15 +177,15 @@ def tensors_of(held: Any) -> Iterator[Tensor]:
             yield from tensors_of(each)
 
 
-def changed(held: Any, change: Callable[[Tensor], Tensor]) -> Any:
-    """What a checkpoint holds, with its tensors changed; parameters stay parameters."""
+def changed(held: Any, change: Callable[[Any], Any]) -> Any:
+    """What a checkpoint holds, tensors and arrays changed; parameters stay parameters."""
     if isinstance(held, dict):
         return {name: changed(each, change) for name, each in held.items()}
     if isinstance(held, list | tuple):
         return type(held)(changed(each, change) for each in held)
-    if not isinstance(held, Tensor) or (new := change(held)) is held:
+    if not isinstance(held, Tensor | np.ndarray) or (new := change(held)) is held:
         return held
-    return torch.nn.Parameter(new.detach()) if held.requires_grad else new
+    return torch.nn.Parameter(new.detach()) if getattr(held, "requires_grad", False) else new
 
 
 def restore_rates(session: SessionState, model: Any) -> None:

@@ -171,6 +171,18 @@ def test_a_part_of_a_checkpoint_has_the_rows_of_its_gaussians(stage_one, tmp_pat
     assert len(counted) >= 3 * 6  # six parameters and two moments of each
 
 
+def test_arrays_that_a_checkpoint_counts_gaussians_in_are_cut_like_its_tensors(tmp_path):
+    kept, rows = torch.tensor([True, False, True]), torch.arange(3)
+    state = {"param_groups": [], "seen": rows.numpy(), "scenes": np.arange(2.0), "name": "a"}
+    torch.save(((rows, state), 10), tmp_path / "chkpnt10.pth")
+    (tmp_path / "part").mkdir()
+    path = part_of(tmp_path / "chkpnt10.pth", kept, tmp_path / "part")
+    (tensor, part), _ = torch.load(path, weights_only=False)
+    assert tensor.tolist() == part["seen"].tolist() == [0, 2]
+    assert isinstance(part["seen"], np.ndarray)
+    assert part["scenes"].tolist() == [0, 1]
+
+
 def test_a_part_of_a_ply_has_all_its_columns(stage_one, tmp_path):
     ply = stage_one[1] / "point_cloud/iteration_10/point_cloud.ply"
     whole = PlyData.read(ply)["vertex"].data
