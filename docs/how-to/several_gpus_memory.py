@@ -59,6 +59,8 @@ def peak() -> int:
     return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM"))
 
 
+if len(sys.argv) != 3 or not sys.argv[1].isdecimal():
+    sys.exit(__doc__)
 count, train = int(sys.argv[1]), sys.argv[2]
 shots = [shot(LENGTH * index / 16) for index in range(16)]
 before = peak()

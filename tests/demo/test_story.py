@@ -12,7 +12,7 @@ from cli.commands import run_json
 
 from fragprune_plugins.workbench.demo import folder
 from fragprune_plugins.workbench.demo.work import BANNER, DemoSettings, host_command
-from fragprune_plugins.workbench.figures.wording import outcome
+from fragprune_plugins.workbench.figures.wording import headlines, outcome
 
 TINY = """
 import json, sys
@@ -83,7 +83,9 @@ def test_pictures_and_page_are_there(demo):
     for file in report["files"]:
         assert file in page or file in ("index.html", f"pictures/{BANNER}")
     assert report["larger"]["size"] == "96x72"
-    assert "frames of 96x72" in page
+    assert "96x72" not in page  # one size, so that its tile and its sentence quote one figure
+    (_, (_, said), _) = headlines(report, report["control"])
+    assert said in page
     assert Path(report["model_after"]).exists()
 
 

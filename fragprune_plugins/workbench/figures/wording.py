@@ -198,20 +198,15 @@ def outcome_in_training(data: Mapping[str, Any]) -> str:
 
 
 def headlines(data: Mapping[str, Any], control: dict[str, Any] | None) -> list[tuple[str, str]]:
-    """Fragments, frame time, picture of a fine-tuning: (the figure, what it says) of each.
-
-    Frames are those of "larger" pictures, if its figures have them.
-    """
+    """Fragments, frame time, picture of a fine-tuning: (the figure, what it says) of each."""
     before, after = data["before"], data["after"]
-    larger = data.get("larger", data)
-    of = f" of {larger['size']}" if "size" in larger else ""
     was, now = (each["fragments_per_pixel"] for each in (before, after))
-    slow, fast = (larger[key]["frame_ms"] for key in ("before", "after"))
-    faster, _, claimed = _faster(larger["before"], larger["after"])
+    slow, fast = (each["frame_ms"] for each in (before, after))
+    faster, _, claimed = _faster(before, after)
     if claimed:
-        frame = f"{faster:.2f}x", f"as fast: frames{of} in {slow:.2f} → {fast:.2f} ms"
+        frame = f"{faster:.2f}x", f"as fast: frames in {slow:.2f} → {fast:.2f} ms"
     else:  # no ratio: a busy machine tells none
-        frame = f"{slow:.1f} → {fast:.1f} ms", f"for frames{of}: no difference beyond the noise"
+        frame = f"{slow:.1f} → {fast:.1f} ms", "for frames: no difference beyond the noise"
     if after.get("target") == ITSELF:
         figure = "equal" if _same(after) else f"{after['psnr']:.1f} dB"
         picture = figure, "PSNR of the picture against the original's own"
