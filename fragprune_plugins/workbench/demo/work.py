@@ -26,12 +26,7 @@ from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.demo.folder import claiming, clear
 from fragprune_plugins.workbench.demo.scene import POINTS, VIEWS, WIDTH, make_scene
 from fragprune_plugins.workbench.figures import records, wording
-from fragprune_plugins.workbench.figures.evaluate import (
-    Candidate,
-    enlarged,
-    frame_times,
-    measure_all,
-)
+from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.report import page as report_page
 from fragprune_plugins.workbench.run.work import Looking, figures_of
@@ -75,13 +70,10 @@ def demo(*, out: Path, iters: int, seed: int, engine: EngineOptions) -> Report:
     drawing = replace(engine, device=str(where))
     settings = DemoSettings(iterations=iters, finetune=iters // 2, seed=seed, engine=drawing)
     report = run_demo(out, settings, partial(click.echo, err=True))
-    larger = report["larger"]
     table = wording.describe(wording.columns_of(report))
     told = [wording.outcome("run", report, report["control"]), *wording.begun(report)]
-    frames = wording.frames(larger["before"], larger["after"])
     text = (
         f"\n{table}\n\n" + "\n".join(told) + "\n"
-        f"Of larger pictures, {larger['size']}: {frames}.\n"
         f"Took {report['seconds']:.0f} s. Open {out / 'index.html'} for the pictures. "
         f"To turn it: fragprune view {wording.quoted(out)}"
     )
@@ -174,20 +166,13 @@ def write_page(
     curves: list[dict[str, float]],
     engine: EngineOptions,
 ) -> list[str]:
-    """Write ``pictures/`` and ``index.html``; returns their files, relative to ``out``.
-
-    Adds "larger" to the report: frame times of pictures as large as the page's.
-    """
+    """Write ``pictures/`` and ``index.html``; returns their files, relative to ``out``."""
     pictures = out / "pictures"
     saved = (report[f"model_{key}"] for key in ("before", "after"))
     one, other = (models.load(path, device=engine.device) for path in saved)
     original, pruned = Candidate(one.untruncated()), Candidate(other)
     shots = sorted(load_dataset(scene).test, key=lambda shot: shot.name != _FIRST)
     rasterizer = engine_for(engine.name, engine.device)
-    views = [enlarged(shot.view, LARGER).to(engine.device) for shot in shots]
-    times = frame_times([original, pruned], views, rasterizer, repeats=_REPEATS)
-    size = f"{views[0].width}x{views[0].height}"
-    report["larger"] = {"size": size, "before": times[0], "after": times[1]}
     drawn = report_page.draw_views(pictures, original, pruned, shots, rasterizer, LARGER)
     report_page.save_banner(pictures / BANNER, pictures, drawn)
     files = [*drawn.files, BANNER]

@@ -60,11 +60,7 @@ def render(
     """Do what ``fragprune render`` promises; its options are the arguments."""
     film = out.suffix.lower() == ".mp4"
     _expect_place(out, film=film, shard=shard)
-    size: int | Resolution = scene.resolution
-    if scene.data is None and not orbit:
-        if cameras is None and "resolution" not in scene.given:
-            size = trained_size(model)
-        cameras = _expect_cameras(cameras or cameras_of(model))
+    cameras, size = _cameras(model, cameras, scene, orbit=orbit)
     rasterizer, device = opening.open_engine(engine)
     writable_folder(out.parent if film else out)
     filtered, drawing = opening.as_trained(model)
@@ -141,15 +137,21 @@ def _expect_place(out: Path, *, film: bool, shard: bool) -> None:
         filming.require_encoder()
 
 
-def _expect_cameras(cameras: Path | None) -> Path:
-    if cameras is None:
+def _cameras(
+    model: Path, named: Path | None, scene: SceneOptions, *, orbit: bool
+) -> tuple[Path | None, int | Resolution]:
+    """The file of cameras, the training's if none is named, and the size of the pictures."""
+    if scene.data is not None or orbit:
+        return None, scene.resolution
+    if (cameras := named or cameras_of(model)) is None:
         raise UsageError(
             "options",
             "neither --cameras, --data nor --orbit, and no cameras.json of a training around MODEL",
             "cameras to draw from",
             "Pass --cameras FILE, --data FOLDER or --orbit.",
         )
-    return cameras
+    trained = named is None and "resolution" not in scene.given
+    return cameras, trained_size(model) if trained else scene.resolution
 
 
 def _views(
