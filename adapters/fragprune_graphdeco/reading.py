@@ -48,26 +48,15 @@ _OTHER_FLAGS = ("hydra", "omegaconf", "tyro", "jsonargparse", "fire", "gin", "cl
 
 
 @lru_cache(maxsize=256)
-def _identifiers(tree: ast.Module | None) -> dict[str, int]:
-    """Every name, attribute, definition and parameter in a tree, with its first line."""
-    lines: dict[str, int] = {}
-    for node in nodes(tree):
-        for kind in ("id", "attr", "name", "arg"):
-            name = getattr(node, kind, None)
-            if isinstance(name, str):
-                lines.setdefault(name, getattr(node, "lineno", 0))
-    return lines
+def _identifiers(tree: ast.Module | None) -> frozenset[Any]:
+    """Every name, attribute, definition and parameter in a tree."""
+    kinds = ("id", "attr", "name", "arg")
+    return frozenset(getattr(node, kind, None) for node in nodes(tree) for kind in kinds)
 
 
-def mentions(repo: HostRepo, modules: Iterable[str], names: Iterable[str]) -> dict[str, str]:
-    """Which of the names occur as identifiers, attributes or parameters, and where."""
-    wanted = set(names)
-    seen: dict[str, str] = {}
-    for module in modules:
-        lines = _identifiers(repo.tree(module))
-        for name in (each for each in lines if each in wanted):
-            seen.setdefault(name, f"{module}:{lines[name]}")
-    return seen
+def mentions(repo: HostRepo, modules: Iterable[str], names: Iterable[str]) -> set[str]:
+    """Which of the names occur as identifiers, attributes or parameters."""
+    return set(names) & frozenset().union(*(_identifiers(repo.tree(each)) for each in modules))
 
 
 @dataclass(frozen=True)
