@@ -87,7 +87,8 @@ def test_a_signal_ends_what_runs_and_nothing_more_starts(number, code, fork, pho
     trains = f"python {root}/train.py {words}"
     inner = f"{trains}touch {tmp_path}/after\n{trains}"
     lines = "nohup sleep 90 &\npython -c 'import time; time.sleep(60)' &\n"
-    lines += f"sh {script_of(tmp_path, inner, 'inner.sh')} &\npython {root}/train_slow.py {words}"
+    lines += f"sh {script_of(tmp_path, inner, 'inner.sh')} &\n"
+    lines += f"python {root}/train_slow.py -s {photographs} -m {tmp_path}/slow\n"
     script = script_of(tmp_path, f"{lines}touch {tmp_path}/after\n{trains}")
     line = [sys.executable, "-m", "fragprune_plugins", "run", "--device", "cpu", "--", "sh", script]
     how = {"stdout": subprocess.PIPE, "text": True, "start_new_session": True}
