@@ -156,8 +156,8 @@ def test_of_a_trial_nothing_is_left_in_a_gpus_memory(model, photographs, engine,
     made = []
 
     class Noted(trial.Training):
-        def __init__(self, *given, **named):
-            super().__init__(*given, **named)
+        def __init__(self, *given):
+            super().__init__(*given)
             made.append(weakref.ref(self))
 
     monkeypatch.setattr(trial, "Training", Noted)

@@ -23,8 +23,7 @@ DROPOUT, KEEP = 0.2, 0.6
 """What suits a model that knows its photographs by heart; docs/results.md has the runs."""
 
 BY_HEART = 0.2
-"""dB that a model forgets, at the hosts' rates, if it knows its photographs by heart; others 0.05
-at most."""
+"""dB that a model forgets in a trial if it knows its photographs by heart; others 0.05 at most."""
 
 STEPS = 100
 _VIEWS = 24  # to measure on
@@ -103,8 +102,7 @@ def forgotten(
     settings = Settings(iterations=STEPS, goal=goal, threshold_lr=0.0, stop=None, seed=seed)
     half, alone = replace(dataset, train=learned), Processes(Ranks())
     alone.first = False  # no observer is told of its steps
-    schedule = Schedule(settings)
-    training = Training(model, half, settings, schedule, engine, alone, lively=1.0)
+    training = Training(model, half, settings, Schedule(settings), engine, alone)
     training.learn(progress=False)
     other = training.result_model()
     training.end()
