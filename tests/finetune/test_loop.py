@@ -39,10 +39,19 @@ def test_what_is_not_named_stays_to_the_bit(model, dataset, train, moving):
         assert not getattr(result.model, name).requires_grad
 
 
-@pytest.mark.parametrize(("dropout", "times"), [(0.2, 4), (None, 1)])
-def test_with_dropout_rates_are_four_times_those_of_hosts(model, dataset, dropout, times):
+@pytest.mark.parametrize(
+    ("settings", "times"),
+    [
+        (Settings(iterations=1, dropout=0.2), 4),
+        (Settings(iterations=1), 1),
+        (Settings(iterations=1, dropout=0.2, itself=True), 1),
+        (Settings(iterations=1, dropout=0.2, train="appearance"), 1),
+    ],
+)
+def test_photographs_with_dropout_teach_all_at_four_times_the_rates(
+    model, dataset, settings, times
+):
     """Adam's first step is the rate, whatever the gradient: 0.0025 for colours in 3DGS."""
-    settings = Settings(iterations=1, dropout=dropout)
     moved = finetune(model, dataset, settings).model.f_dc - model.f_dc
     assert float(moved.abs().max()) == pytest.approx(0.0025 * times, rel=1e-3)
 
