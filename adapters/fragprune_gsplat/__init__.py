@@ -115,25 +115,33 @@ def surfels(call: SeamCall) -> None:
     raise InputError(str(call.seam), found, "gsplat.rasterization", remedy)
 
 
-def splats_in(saved: Any) -> Tensor | None:
-    """(N, 3) the means in what ``torch.save`` and ``torch.load`` are given; None without any.
+class Splats(dict[str, Any]):
+    """Parameters in what is saved or was loaded; a session may ask whether it knows them."""
 
-    They are in a dict of parameters, or under "splats" as gsplat's own trainer has it.
+    __hash__ = object.__hash__  # type: ignore[assignment]
+
+
+def splats_in(saved: Any) -> Splats | None:
+    """The parameters in a dict, or in one inside it; None without any.
+
+    gsplat's own trainer has them under "splats".
     """
     import torch
 
-    found = saved.get("splats", saved) if isinstance(saved, Mapping) else None
-    if not isinstance(found, Mapping) or not {"means", "quats", "opacities"} <= found.keys():
-        return None
-    return found["means"] if isinstance(found["means"], torch.Tensor) else None
+    kinds, names = (Mapping, torch.nn.ParameterDict), ("means", "quats", "opacities")
+    found = [saved, *saved.values()] if isinstance(saved, kinds) else []
+    for each in [part for part in found if isinstance(part, kinds)]:
+        if all(isinstance(each.get(name), torch.Tensor) for name in names):
+            return Splats(each)
+    return None
 
 
 def read_again(call: SeamCall) -> tuple[Path, Tensor] | None:
     """The file and its means, if ``torch.load`` read parameters from one."""
-    file, means = call.arguments["f"], splats_in(call.result)
-    if means is None or not isinstance(file, str | os.PathLike):
+    file, splats = call.arguments["f"], splats_in(call.result)
+    if splats is None or not isinstance(file, str | os.PathLike):
         return None
-    return Path(file), means.detach().cpu()
+    return Path(file), splats["means"].detach().cpu()
 
 
 def _operation(name: str, *needs: str) -> Seam:
@@ -218,20 +226,23 @@ class Gsplat(HostAdapter):
         return trainer.SimpleTrainer(script) if trainer.recognised(script) else None
 
     def model_of(self, call: SeamCall) -> Any:
-        """The dict that a strategy changes, or the means if a call has only them."""
+        """The dict that a strategy changes, the means if a call has only them, or what is saved.
+
+        What is saved is often a copy, in which the session looks for the Gaussians of a model.
+        """
         import torch
 
         given = call.arguments
-        if "obj" in given:  # of torch.save
-            to_file = isinstance(given["f"], str | os.PathLike)
-            return splats_in(given["obj"]) if to_file else None
+        if "obj" in given or "save_to" in given:  # of torch.save, and of export_splats
+            # torch.save takes an open file too, and the formats but PLY sort their rows
+            paired = isinstance(given.get("f", ""), str | os.PathLike)
+            paired &= given.get("format", "ply") == "ply"
+            return splats_in(given.get("obj", given)) if paired else None
         params = given.get("params", given.get("means"))
         if isinstance(params, dict):
             found = "a plain dict, which cannot hold a session's state"
             remedy = "Convert it: params = torch.nn.ParameterDict(params)."
             raise SessionError("params", found, "torch.nn.ParameterDict", remedy)
-        if given.get("format", "ply") != "ply":
-            return None  # other formats sort their rows
         return params if isinstance(params, torch.nn.ParameterDict | torch.Tensor) else None
 
     def group_name(self, model: Any, group: Mapping[str, Any]) -> str | None:

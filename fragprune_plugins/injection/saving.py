@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -46,9 +47,9 @@ def learner(session: SessionState, call: SeamCall) -> tuple[Any, ModelState | No
     """The model that is saved, or that of which it is an exact copy; DivergedError if it is NaN."""
     model = call.model
     if session.models and model not in session.models:
-        of = session.adapter.means, session.adapter.opacities
+        same = partial(np.array_equal, equal_nan=True)
         for known in session.models:
-            if all(torch.equal(each(known).cpu(), each(model).cpu()) for each in of):
+            if all(map(same, values(session, known), values(session, model))):
                 model = known
                 break
         else:
@@ -58,6 +59,12 @@ def learner(session: SessionState, call: SeamCall) -> tuple[Any, ModelState | No
     if state is not None and state.stage is not None and state.stage.plan is not None:
         state.stage.check()
     return model, state
+
+
+def values(session: SessionState, model: Any) -> list[Any]:
+    """What tells a model's Gaussians from others' and from those that they were before."""
+    both = session.adapter.means(model), session.adapter.opacities(model)
+    return [each.detach().cpu().float().numpy() for each in both]
 
 
 def on_load(session: SessionState, call: SeamCall) -> Any:

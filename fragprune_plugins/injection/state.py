@@ -179,8 +179,8 @@ class SessionState:
         if not isinstance(found, Tensor):
             return found
         models = {**dict.fromkeys(self.models), **dict.fromkeys(self.optimizers)}
-        known = ((model, self.adapter.means(model)) for model in models)
-        return next((m for m, means in known if _are(found, means)), None)
+        at = found.data_ptr()
+        return next((m for m in models if self.adapter.means(m).data_ptr() == at), None)
 
     def standing_still(self, model: Any) -> bool:
         """Whether the model is frozen, because stage 2 has begun."""
@@ -293,10 +293,3 @@ class SessionState:
             expected = f"{len(state.store)}, one per threshold"
             remedy = "Report this with the host's commit: its rows changed at no seam."
             raise AlignmentError(where, f"{rows} Gaussians", expected, remedy)
-
-
-def _are(found: Tensor, means: Tensor) -> bool:
-    """Whether a tensor is a model's means, or a copy of them from a GPU, such as hosts save."""
-    if found.device == means.device or found.shape != means.shape:
-        return found.data_ptr() == means.data_ptr()
-    return torch.equal(found, means.detach().to(found.device))

@@ -35,17 +35,20 @@ def test_an_engine_is_opened_once_a_device_and_a_slow_one_told(monkeypatch, capl
 
 
 @pytest.mark.skipif(torch.__version__ < "2.5", reason="no such device can be made")
-def test_a_copy_that_a_host_takes_from_a_gpu_to_save_it_is_its_models():
-    """``{name: each.cpu()}``; on a CPU that is the tensor itself."""
+@pytest.mark.parametrize("diverged", [False, True])
+def test_a_copy_that_a_host_takes_from_a_gpu_to_save_it_is_its_models(diverged):
+    """``{name: each.cpu()}``; a learner that diverged is refused, and not taken for another."""
     session = state()
-    model, other = follow(session)[0], follow(session)[0]
+    (_, _), (other, known), copy = follow(session), follow(session), Model(6)
+    session.adapter.opacities = lambda model: model.opacity
     with elsewhere.there(), torch.no_grad():
-        other.xyz += 1
-        for each in (model, other):
-            each.xyz = each.xyz.detach().to(elsewhere.DEVICE)
-        session.adapter.model_of = lambda call: call
-        assert session.model_of(other.xyz.cpu()) is other
-        assert session.model_of(other.xyz.cpu() + 1) is None
+        other.xyz += torch.nan if diverged else 1
+        copy.xyz = other.xyz.detach().clone()
+        other.xyz = other.xyz.detach().to(elsewhere.DEVICE)
+        asked = SimpleNamespace(model=copy, seam="save")
+        assert saving.learner(session, asked) == (other, known)
+        copy.opacity += 1
+        assert saving.learner(session, asked) == (copy, None)
 
 
 def saved(session):

@@ -151,8 +151,7 @@ class GsplatHost(Host):
         if not axes():
             torch.save(model.state_dict(), path)
             return
-        tensors = {name: model[name].detach() for name in KEYS}
-        tensors["means"] = model["means"]  # by which the model is known
+        tensors = {name: model[name].detach().clone() for name in KEYS}
         import_module("gsplat.exporter").export_splats(**tensors, format="ply", save_to=str(path))
 
     def load(self, model: Any, path: Any) -> None:

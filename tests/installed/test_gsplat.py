@@ -456,20 +456,31 @@ def test_thresholds_of_a_file_wait_while_another_model_is_drawn(session_on, tmp_
             draw(saved)
 
 
-@pytest.mark.parametrize("nested", [True, False])
+def copied(params):
+    return {name: value.detach().clone() for name, value in params.items()}
+
+
+SAVED = {
+    "state": lambda params: params.state_dict(),
+    "copies": copied,
+    "nested": lambda params: {"step": 3, "splats": params.state_dict()},
+    "copies by another name": lambda params: {"step": 3, "params": copied(params)},
+}
+
+
+@pytest.mark.parametrize("form", SAVED)
 @pytest.mark.parametrize("learn", [True, False])
-def test_torch_saves_and_loads_parameters_with_thresholds(session_on, tmp_path, nested, learn):
+def test_torch_saves_and_loads_parameters_with_thresholds(session_on, tmp_path, form, learn):
     file, logits = tmp_path / "splats.pt", torch.randn(40)
 
     def loaded():
         saved = torch.load(file)
-        return saved["splats"] if nested else saved
+        return saved if "means" in saved else next(reversed(saved.values()))
 
     with session_on(Gsplat()) as session:
         params, _ = attached()
         session.store(params).logits = logits.clone().requires_grad_(True)
-        state = params.state_dict()
-        torch.save({"step": 3, "splats": state} if nested else state, file)
+        torch.save(SAVED[form](params), file)
         with torch.no_grad():
             picture = draw(params)[0]
     with session_on(Gsplat(), learn=learn) as session:
@@ -487,6 +498,21 @@ def test_torch_saves_and_loads_parameters_with_thresholds(session_on, tmp_path, 
         assert torch.equal(session.store(again).logits, logits)
         del saved["quats"]
         torch.save(saved, io.BytesIO())  # neither a file nor all parameters
+
+
+@pytest.mark.parametrize("name", ["means", "opacities"])
+def test_copies_of_other_gaussians_are_saved_loudly(session_on, tmp_path, caplog, name):
+    """Which thresholds were theirs is not known: those of the model have learned since."""
+    with session_on(Gsplat()) as session:
+        params, _ = attached()
+        session.store(params).logits = torch.randn(40).requires_grad_(True)
+        best = copied(params)
+        params[name].data += 0.1
+        torch.save(best, tmp_path / "best.pt")
+        torch.save(best, io.BytesIO())
+    (said,) = caplog.messages
+    assert said.startswith("torch:save: without cutoffs: no model that learns has exactly these")
+    assert not sidecar.find(tmp_path / "best.pt")
 
 
 def test_a_file_that_was_read_for_something_else_changes_nothing(session_on, tmp_path):
