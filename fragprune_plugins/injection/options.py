@@ -16,7 +16,6 @@ from fragprune_plugins.learning.schedule import Settings
 
 Stage = Literal["auto", "finetune", "joint", "off"]
 
-
 Look = Callable[[Path, Photographs, Mapping[str, Any], Settings], tuple[Settings, Tensor | None]]
 """Is given the PLY of stage 1, its photographs, fields of ``RasterInputs`` with which the host
 draws it, and the settings that were asked for.

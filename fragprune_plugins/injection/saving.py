@@ -47,9 +47,10 @@ def learner(session: SessionState, call: SeamCall) -> tuple[Any, ModelState | No
     """The model that is saved, or that of which it is an exact copy; DivergedError if it is NaN."""
     model = call.model
     if session.models and model not in session.models:
-        same = partial(np.array_equal, equal_nan=True)
+        of = session.adapter.means, session.adapter.opacities
         for known in session.models:
-            if all(map(same, values(session, known), values(session, model))):
+            pairs = ((each(known).detach().cpu(), each(model).detach().cpu()) for each in of)
+            if all(np.array_equal(a.float(), b.float(), equal_nan=True) for a, b in pairs):
                 model = known
                 break
         else:
@@ -59,12 +60,6 @@ def learner(session: SessionState, call: SeamCall) -> tuple[Any, ModelState | No
     if state is not None and state.stage is not None and state.stage.plan is not None:
         state.stage.check()
     return model, state
-
-
-def values(session: SessionState, model: Any) -> list[Any]:
-    """What tells a model's Gaussians from others' and from those that they were before."""
-    both = session.adapter.means(model), session.adapter.opacities(model)
-    return [each.detach().cpu().float().numpy() for each in both]
 
 
 def on_load(session: SessionState, call: SeamCall) -> Any:
@@ -119,17 +114,15 @@ def attach_file(session: SessionState, model: Any, expected: Tensor, store: Thre
     means, known = session.adapter.means(model), session.models.get(model)
     parts = slice(1), slice(None)  # the first row tells most others apart
     same = all(torch.equal(means.detach()[part].cpu(), expected[part]) for part in parts)
-    if known is not None:
-        if same:
-            known.store.load_state_dict(store.state_dict())
-            session.unpacked = None
+    if known is not None and not same:
         return
     if not same:
         found = f"{len(means)} Gaussians that differ from the unpacked file's"
         said = f"the file's {len(expected)} Gaussians in its order"
         remedy = "Report this with the host's commit: it draws another model after unpacking."
         raise AlignmentError(f"{session.adapter.name}: unpacked model", found, said, remedy)
-    session.take_up(model, store.state_dict())
+    take = partial(session.take_up, model) if known is None else known.store.load_state_dict
+    take(store.state_dict())
     session.unpacked = None
 
 
@@ -143,7 +136,7 @@ def on_capture(session: SessionState, call: SeamCall) -> Any:
     if state is not None and (session.standing_still(model) or state.store.cuts):
         session.expect_rows(model, state, str(call.seam))
         held = optimizer_state(result, f"{session.adapter.name}: checkpoint")
-        held[CHECKPOINT_KEY] = state.store.state_dict()
+        held[CHECKPOINT_KEY] = state.store.state_dict() | session.midway
     return result
 
 
@@ -155,11 +148,9 @@ def on_restore(session: SessionState, call: SeamCall) -> Any:
     capture = brought(capture, session.adapter.means(model).device)
     result = call.run(**{call.seam.needs[0]: capture})
     restore_rates(session, model)
-    state = session.models.get(model)
     if saved is not None:
-        if state is None:
-            device = session.adapter.means(model).device
-            state = session.models[model] = ModelState(ThresholdStore(0, device))
+        device = session.adapter.means(model).device
+        state = session.models.setdefault(model, ModelState(ThresholdStore(0, device)))
         state.store.load_state_dict(saved)
         session.expect_rows(model, state, str(call.seam))
     return result

@@ -64,10 +64,10 @@ def find(adapter: ScriptAdapter, host: HostCommand, output: Path | None) -> Star
         return Start(at, path, "the command names it")
     where, flag = output or "no output folder", host.line.spellings("resume")[-1]
     saved, newer = files(adapter, output), 0
-    while saved and _learned(saved[-1][1]):
-        at, _ = saved.pop()
+    while saved and (known := _learned(saved[-1][1])) is not None:
+        saved.pop()
         newer += 1
-        if at == host.iterations:  # learned within its training, from which others are, or older
+        if known.get("midway"):  # other files are from within that training, or older
             saved = []
     if not saved:
         found, expected = "no model", f"{flag} FILE, or {host.line.output[-1]} DIR of a training"
@@ -78,7 +78,7 @@ def find(adapter: ScriptAdapter, host: HostCommand, output: Path | None) -> Star
             remedy = f"To continue from one of these files, name it with {flag}."
         raise UsageError("--stage finetune", f"{found} in {where}", expected, remedy)
     iteration, path = saved[-1]
-    later = [(at, file) for at, file in saved if at > iteration and not _learned(file)]
+    later = [(at, file) for at, file in saved if at > iteration and _learned(file) is None]
     if later:
         log.warning(
             "%s is of a later iteration, but it is older than the file from which stage 2 starts; "
@@ -94,7 +94,7 @@ def trains_on(host: HostCommand) -> bool:
     line, path = host.line, Path(host.flags.resume)
     if path.suffix == ".ply" or line.restarts or host.script.name in line.continues:
         return host.script.name in line.continues
-    return resumed_at(line, path) < host.iterations and not _learned(path)
+    return resumed_at(line, path) < host.iterations and _learned(path) is None
 
 
 def ended(adapter: ScriptAdapter, host: HostCommand) -> Start | None:
@@ -209,11 +209,13 @@ def part_of(start: Path, kept: Tensor | None, folder: Path) -> Path:
     return target
 
 
-def _learned(path: Path) -> bool:
-    """Whether stage 2 or a control wrote the file, and not stage 1."""
-    if path.suffix == ".ply":
-        return sidecar.belongs(path) or read_thresholds(path) is not None
-    return CHECKPOINT_KEY in optimizer_state(_read_checkpoint(path)[0], str(path))
+def _learned(path: Path) -> dict[str, Any] | None:
+    """What a file tells of how it learned; None if stage 1 wrote it, not stage 2 or a control."""
+    if path.suffix != ".ply":
+        return optimizer_state(_read_checkpoint(path)[0], str(path)).get(CHECKPOINT_KEY)
+    if sidecar.belongs(path):
+        return sidecar.load(path)[1].settings
+    return None if read_thresholds(path) is None else {}
 
 
 def _iteration_of_ply(ply: Path) -> int:

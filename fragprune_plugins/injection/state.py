@@ -123,8 +123,9 @@ class SessionState:
     ) -> None:
         self.adapter, self.repo, self.plugins = adapter, repo, plugins
         self.settings = settings or Settings()
-        self.learn, self.from_step, self.freeze = learn, from_step, freeze
-        self.start = start
+        self.learn, self.from_step, self.freeze, self.start = learn, from_step, freeze, start
+        # Is saved with thresholds: whether they learn in the midst of the host's own training.
+        self.midway = {"midway": True} if from_step or not freeze else {}
         self.schedule = schedule or schedule_for(self.settings, plugins)
         self.output, self.origin = output, origin
         self.curves: list[dict[str, float]] = []
@@ -169,10 +170,6 @@ class SessionState:
             self.engines[device] = engine
         return self.engines[device]
 
-    def processor(self, device: torch.device) -> str:
-        """The name of a GPU, or the kind of another device."""
-        return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
-
     def model_of(self, call: SeamCall) -> Any:
         """The model that a call concerns, or None; means from the adapter identify a model too."""
         found = self.adapter.model_of(call)
@@ -181,6 +178,10 @@ class SessionState:
         models = {**dict.fromkeys(self.models), **dict.fromkeys(self.optimizers)}
         at = found.data_ptr()
         return next((m for m in models if self.adapter.means(m).data_ptr() == at), None)
+
+    def processor(self, device: torch.device) -> str:
+        """The name of a GPU, or the kind of another device."""
+        return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
 
     def standing_still(self, model: Any) -> bool:
         """Whether the model is frozen, because stage 2 has begun."""
@@ -244,7 +245,7 @@ class SessionState:
         None removes that of an earlier file of this name, which loading would refuse as stale.
         """
         about: dict[str, Any] = {"adapter": self.adapter.name, "host_commit": self.repo.commit}
-        about["settings"], self.held = self.settings.as_dict(), None
+        about["settings"], self.held = self.settings.as_dict() | self.midway, None
         if whole is not None:
             sidecar.replace_pair(path, whole, store, **about)
         elif store is not None:

@@ -1,5 +1,6 @@
 """Where stage 2 starts: the last file of the host's own training; what starts from stage 2."""
 
+import contextlib
 import json
 import logging
 import os
@@ -13,13 +14,14 @@ from types import SimpleNamespace
 import pytest
 import torch
 from miniatures import runs
-from miniatures.vanilla_3dgs import HOST, running
+from miniatures.vanilla_3dgs import HOST, InterruptAt, running
 
 from fragprune_plugins import Control, Settings
-from fragprune_plugins.errors import HostFailed, SidecarError, UsageError
+from fragprune_plugins.errors import HostFailed, Interrupted, SidecarError, UsageError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.hosts.seams import Role, SeamCall
 from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.plugins.loading import installed
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 command = partial(runs.command, HOST / "train.py")
@@ -111,18 +113,27 @@ def test_training_again_over_a_result_of_stage_two_makes_it_stage_ones(photograp
     assert f"iteration 17, {out / ply(17)}:" in started(out, 17)
 
 
+@pytest.mark.usefixtures("ctrl_c")
+@pytest.mark.parametrize("stage", ["joint", "finetune"])
 @pytest.mark.parametrize("earlier", [True, False], ids=["an older checkpoint", "its own PLY"])
-def test_after_a_joint_training_no_older_file_is_taken_in_its_place(
-    photographs, out, started, tmp_path, earlier
+@pytest.mark.parametrize("last", [10, 9], ids=["whole", "interrupted"])
+def test_after_a_training_that_learned_midway_no_older_file_is_taken_in_its_place(
+    photographs, out, started, tmp_path, plug, stage, earlier, last
 ):
     folder = out if earlier else tmp_path / "joint"
-    words = command(photographs, folder, 10, "--save_iterations", 4)
-    run(words, replace(OPTIONS, stage="joint", from_iter=6))
-    assert sidecar.belongs(folder / ply(10))
-    with pytest.raises(UsageError, match=f"a joint training's and older files in {folder}"):
-        started(folder, 10)
-    line = started(folder, 10, "--start_checkpoint", folder / ply(10))
-    assert f"{folder / ply(10)}: the command names it" in line
+    kind = "--checkpoint_iterations" if earlier else "--save_iterations"
+    words = command(photographs, folder, 10, kind, 4, last)
+    if last < 10:
+        plug(InterruptAt(last if stage == "joint" else last - 6))
+    with pytest.raises(Interrupted) if last < 10 else contextlib.nullcontext():
+        run(words, replace(OPTIONS, stage=stage, from_iter=6))
+    installed.cache_clear()
+    assert sidecar.belongs(folder / ply(last))
+    for iterations in (10, 12):
+        with pytest.raises(UsageError, match=f"a joint training's and older files in {folder}"):
+            started(folder, iterations)
+    line = started(folder, 10, "--start_checkpoint", folder / ply(last))
+    assert f"{folder / ply(last)}: the command names it" in line
 
 
 def test_a_later_ply_goes_before_an_early_checkpoint(photographs, tmp_path, started):
