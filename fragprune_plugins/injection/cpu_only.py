@@ -13,6 +13,7 @@ import re
 import threading
 import time
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 from unittest import mock
 
@@ -50,7 +51,8 @@ class _Redirect(TorchFunctionMode):
             return args[0]
         if func is torch.Tensor.get_device:  # hosts pass it to .to(), which refuses -1
             return torch.device("cpu")
-        names = _NUMBERS if func is torch.Tensor.to else _NAMES
+        number = func is torch.Tensor.to or (func is torch.device and len(args) == 1)
+        names = _NUMBERS if number else _NAMES
         if not names.isdisjoint(map(type, args)):
             args = tuple(_redirected(a) if type(a) in names else a for a in args)
         if "device" in kwargs:
@@ -64,19 +66,27 @@ class _Generator(torch.Generator):
         return super().__new__(cls, _redirected(device))  # type: ignore[call-arg]
 
 
+def _nothing(*_: Any, **__: Any) -> int:
+    """Replaces a CUDA call that has no meaning on the CPU: device 0, and no memory in use."""
+    return 0
+
+
 class _Event(contextlib.nullcontext[None]):
     """A CUDA event that reads the wall clock; also a stream or a device, which order nothing."""
+
+    wait = wait_event = wait_stream = synchronize = _nothing  # work is done when a call returns
 
     def __init__(self, *_: Any, **__: Any) -> None:
         super().__init__()
         self._time = 0.0
 
-    def __getattr__(self, _: str) -> Any:  # CPU work is done when a call returns
-        return _nothing
-
     def record(self, *_: Any) -> None:
         """Store the current time."""
         self._time = time.perf_counter()
+
+    def record_event(self, event: _Event | None = None) -> _Event:
+        """An event of a stream."""
+        return event or _Event()
 
     def query(self) -> bool:
         """Whether the work before the event is done: always."""
@@ -87,10 +97,8 @@ class _Event(contextlib.nullcontext[None]):
         return (end._time - self._time) * 1e3
 
 
-def _nothing(*_: Any, **__: Any) -> int:
-    """Replaces a CUDA call that has no meaning on the CPU: device 0, and no memory in use."""
-    return 0
-
+_MEMORY = 8 << 30  # bytes, as of a small GPU: hosts choose by it how much they do at once
+_GPU = SimpleNamespace(name="cpu", total_memory=_MEMORY, major=0, minor=0, multi_processor_count=1)
 
 _SUBSTITUTES: dict[str, Any] = {
     **dict.fromkeys(("Event", "Stream", "stream", "current_stream", "default_stream"), _Event),
@@ -98,6 +106,8 @@ _SUBSTITUTES: dict[str, Any] = {
     **dict.fromkeys(("set_device", "synchronize", "empty_cache", "current_device"), _nothing),
     **dict.fromkeys(("reset_peak_memory_stats", "reset_max_memory_allocated"), _nothing),
     **dict.fromkeys(("memory_allocated", "max_memory_allocated", "memory_reserved"), _nothing),
+    "get_device_properties": lambda *_: _GPU,
+    "mem_get_info": lambda *_: (_MEMORY, _MEMORY),
     "FloatTensor": torch.FloatTensor,
     "IntTensor": torch.IntTensor,
 }

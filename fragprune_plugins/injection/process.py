@@ -128,12 +128,10 @@ def forget_modules(root: Path, known: set[str], packages: tuple[str, ...] = ()) 
     """
     for name in sys.modules.keys() - known:
         file = getattr(sys.modules[name], "__file__", None) or ""
-        if name.split(".")[0] in packages:
-            own = not file or file.endswith(".py")
-        else:
-            own = Path(file).is_relative_to(root) and _ENVIRONMENT.isdisjoint(
-                Path(file).relative_to(root.parent).parts
-            )
+        own = not file or file.endswith(".py")
+        if name.split(".")[0] not in packages:
+            parts = Path(file).parts[len(root.parent.parts) :]
+            own = Path(file).is_relative_to(root) and _ENVIRONMENT.isdisjoint(parts)
         if own:
             del sys.modules[name]
 

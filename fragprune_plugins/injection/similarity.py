@@ -52,9 +52,8 @@ def images(call: SeamCall) -> tuple[Tensor, Tensor] | None:
         return None
     pair = [call.arguments[name] for name in call.seam.needs]
     for each in pair:
-        if not isinstance(each, Tensor) or each.dtype != torch.float32:
-            return None
-        if each.device.type != "cpu" or not binding.available() or each.ndim not in (3, 4):
+        fits = isinstance(each, Tensor) and each.dtype == torch.float32 and each.ndim in (3, 4)
+        if not (fits and each.device.type == "cpu" and binding.available()):
             return None
     if pair[0].shape != pair[1].shape or (pair[0].ndim == 4 and len(pair[0]) != 1):
         return None

@@ -1,6 +1,7 @@
 """``--device cpu``: what names CUDA runs on the CPU, and afterwards nothing has happened."""
 
 import contextlib
+import copy
 from concurrent.futures import ThreadPoolExecutor
 from threading import Thread
 
@@ -23,6 +24,7 @@ FACTORIES = {
     "to": lambda d: torch.ones(2).to(d),
     "to with dtype": lambda d: torch.ones(2).to(d, torch.float64),
     "to by keyword": lambda d: torch.ones(2).to(device=d),
+    "device": lambda d: torch.ones(2, device=torch.device(d)),
     "module": lambda d: torch.nn.Linear(2, 2).to(d).weight,
     "parameter": lambda d: torch.nn.Parameter(torch.ones(2, device=d)),
 }
@@ -60,7 +62,10 @@ def test_streams_order_nothing_and_random_numbers_come_from_the_cpu():
         with torch.cuda.stream(stream), torch.cuda.device(0):
             tensor = torch.ones(2, device="cuda")
         torch.cuda.current_stream().wait_stream(stream)
+        torch.cuda.current_stream().wait_event(stream.record_event())
         stream.synchronize()
+        assert isinstance(copy.deepcopy(stream), type(stream))
+        assert not hasattr(stream, "no_attribute_of_this_name")
         assert tensor.sum() == 2
         for made in (torch.Generator(device="cuda"), torch.Generator("cuda:0"), torch.Generator()):
             drawn = torch.rand(2, generator=made.manual_seed(3), device="cuda")
@@ -102,6 +107,8 @@ def test_events_measure_and_calls_without_a_meaning_do_nothing():
         torch.cuda.set_device(torch.device("cuda:0"))
         torch.cuda.empty_cache()
         assert torch.cuda.memory_allocated() == torch.cuda.current_device() == 0
+        total = torch.cuda.get_device_properties(0).total_memory
+        assert torch.cuda.mem_get_info() == (total, total)
         assert torch.cuda.is_available() in (True, False)  # hosts ask; we do not lie
 
 
