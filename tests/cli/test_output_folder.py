@@ -49,7 +49,10 @@ def test_pictures_are_drawn_at_the_size_that_the_training_had(
     data, model, tmp_path, trained, more, side
 ):
     """cameras.json has that of the photographs, whatever -r said."""
-    output = tiny.host_output(tmp_path / "out", data, model, resolution=trained)
+    output, pruned = tiny.host_output(tmp_path / "out", data, model, resolution=trained), "r.ply"
+    run_json("finetune", output, "--self", "--iters", 1, "--out", tmp_path / pruned, *more)
+    for model, own in ((output, ("--self", *more)), (tmp_path / pruned, ())):
+        assert f", {side}x{side} pixels" in succeeds("compare", model, model, *own).stdout
     result = succeeds("render", output, "--out", tmp_path / "pictures", *more)
     for each in (tmp_path / "pictures").iterdir():
         with Image.open(each) as picture:

@@ -9,9 +9,10 @@ import torch
 from PIL import Image
 
 from fragprune_plugins.errors import DatasetError
+from fragprune_plugins.hosts.photographs import Resolution
 from fragprune_plugins.workbench.scenes import colmap
 from fragprune_plugins.workbench.scenes import transforms as layout
-from fragprune_plugins.workbench.scenes.cameras import divided, load_cameras, load_scene_cameras
+from fragprune_plugins.workbench.scenes.cameras import load_cameras, load_scene_cameras, sized
 from reference_renderer.covariance import rotation_matrices
 
 TURN = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]  # camera to world, about z
@@ -61,7 +62,7 @@ def test_a_camera_that_is_broken_is_named_by_its_number(tmp_path):
 
 def test_divided_views_have_the_sizes_of_divided_photographs(tmp_path):
     path = written(tmp_path / "cameras.json", [entry(width=41, height=21)])
-    ((name, view),) = divided(load_cameras(path), 4)
+    ((name, view),) = sized(load_cameras(path), Resolution(4))
     assert (name, view.width, view.height) == ("a.b.png", 10, 5)
     assert view.tan_fov_x == pytest.approx(41 / (2 * 30))
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from fragprune_plugins.files.atomic import replacing
+from fragprune_plugins.hosts.photographs import Resolution
 from fragprune_plugins.learning.stage2 import evenly_spaced
 from fragprune_plugins.workbench.audit import page
 from fragprune_plugins.workbench.audit.audit import audit as measured
@@ -21,7 +22,7 @@ from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOpt
 from fragprune_plugins.workbench.figures.records import strict
 from fragprune_plugins.workbench.figures.wording import nothing_drawn
 from fragprune_plugins.workbench.models.model import load, writable_folder
-from fragprune_plugins.workbench.scenes.cameras import divided, load_cameras, load_scene_cameras
+from fragprune_plugins.workbench.scenes.cameras import load_cameras, load_scene_cameras, sized
 from fragprune_plugins.workbench.scenes.output import cameras_of
 
 PAGE, FIGURES = "audit.html", "audit.json"
@@ -97,6 +98,6 @@ def _given(
     every = len(named)
     chosen = list(evenly_spaced(named, count))
     longest = max(max(view.width, view.height) for _, view in chosen)
-    chosen = divided(chosen, divide or -(-longest // LARGEST))
+    chosen = sized(chosen, Resolution(divide or -(-longest // LARGEST)))
     why = f"{len(chosen)} of the {every} cameras of {cameras or data}, evenly spread."
     return Placed(chosen, "given", why)

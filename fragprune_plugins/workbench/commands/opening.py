@@ -20,7 +20,7 @@ from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOpt
 from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.figures.wording import ITSELF
 from fragprune_plugins.workbench.ranks import launched, local_rank
-from fragprune_plugins.workbench.scenes.cameras import divided, load_cameras, load_scene_cameras
+from fragprune_plugins.workbench.scenes.cameras import load_cameras, load_scene_cameras, sized
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 from fragprune_plugins.workbench.scenes.generated import around, own_pictures
 from fragprune_plugins.workbench.scenes.output import (
@@ -29,6 +29,7 @@ from fragprune_plugins.workbench.scenes.output import (
     output_folder,
     over_white,
     trained_on,
+    trained_size,
 )
 
 
@@ -129,7 +130,7 @@ def overridden(photographs: Photographs, scene: SceneOptions) -> Photographs:
     values: dict[str, Any] = {
         "folder": scene.data,
         "images": scene.images if "images" in scene.given else None,
-        "resolution": Resolution(scene.resolution) if "resolution" in scene.given else None,
+        "resolution": scene.resolution if "resolution" in scene.given else None,
         "white_background": scene.white_background or None,
     }
     return replace(photographs, **{key: each for key, each in values.items() if each is not None})
@@ -158,13 +159,13 @@ class OwnCameras:
         scene, seed, held_out = self.scene, self.seed, None
         if scene.data is not None:
             views, test = load_scene_cameras(scene.data, white_background=scene.white_background)
-            held_out = divided(test, scene.resolution)
+            held_out = sized(test, scene.resolution)
         elif self.cameras is not None:
             views = load_cameras(self.cameras, white_background=scene.white_background)
         else:
             background = torch.full((3,), float(scene.white_background))
             views = around(model, background=background, seed=seed)
-        views = divided(views, scene.resolution)
+        views = sized(views, scene.resolution)
         return own_pictures(model, views, held_out, engine=engine, seed=seed)
 
 
@@ -173,7 +174,7 @@ def own_cameras_for(
 ) -> OwnCameras:
     """The cameras that the options name; without any those of the model's training, if it is known.
 
-    As its training did, it is drawn over white.
+    As its training did, it is drawn over white, and they have the size that they had there.
 
     Args:
         orbit: all around it, whatever is known.
@@ -181,7 +182,14 @@ def own_cameras_for(
     named = orbit or scene.data is not None or cameras is not None
     if not named and (cameras := cameras_of(model)):
         click.echo(printable(f"Cameras: {cameras}, of its training"), err=True)
+        scene = at_its_size(model, scene)
     return OwnCameras(over_its_background(model, scene), cameras, seed)
+
+
+def at_its_size(model: Path, scene: SceneOptions) -> SceneOptions:
+    """The options, without ``--resolution`` at the size that a model's training had."""
+    given = "resolution" in scene.given
+    return scene if given else replace(scene, resolution=trained_size(model))
 
 
 def over_its_background(model: Path, scene: SceneOptions) -> SceneOptions:
@@ -216,7 +224,9 @@ def own_cameras(record: records.Record, scene: SceneOptions | None = None) -> Ow
             for name in ("data", "file")
         )
         if "resolution" not in scene.given:
-            scene = replace(scene, resolution=int(values.get("resolution", 1)))
+            size = values.get("resolution", 1)  # a divisor in records of earlier versions
+            size = Resolution(**size) if isinstance(size, dict) else Resolution(int(size))
+            scene = replace(scene, resolution=size)
         white = scene.white_background or bool(values.get("white_background"))
         scene = replace(scene, data=data, white_background=white)
         return OwnCameras(scene, cameras, int(record.data["seed"]))

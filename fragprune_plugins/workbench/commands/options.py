@@ -7,7 +7,7 @@ import math
 import os
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,6 +15,7 @@ import click
 from click.core import ParameterSource
 
 from fragprune_plugins.errors import ModelFileError, UsageError, printable
+from fragprune_plugins.hosts.photographs import Resolution
 from fragprune_plugins.workbench.commands.rules import Alone
 from fragprune_plugins.workbench.ranks import launched
 from fragprune_plugins.workbench.scenes.output import newest_model
@@ -173,7 +174,7 @@ class SceneOptions:
 
     data: Path | None = None
     images: str = "images"  # folder of ``data``
-    resolution: int = 1  # divisor of the images' sides
+    resolution: Resolution = field(default_factory=Resolution)
     white_background: bool = False
     given: frozenset[str] = frozenset()  # names of the options that the user gave
 
@@ -182,7 +183,7 @@ class SceneOptions:
         return {
             "data": None if self.data is None else str(self.data.resolve()),
             "file": None if cameras is None else str(cameras.resolve()),
-            "resolution": self.resolution,
+            "resolution": asdict(self.resolution),
             "white_background": self.white_background,
         }
 
@@ -194,8 +195,9 @@ def scene_options(data: str = f"{DATA_HELP} {TRAINED_ON}") -> Callable[[Function
     def gather(given: dict[str, Any]) -> dict[str, Any]:
         source = click.get_current_context().get_parameter_source
         chosen = frozenset(name for name in names if source(name) is not ParameterSource.DEFAULT)
-        data, images, resolution, white_background = map(given.pop, names)
-        return {"scene": SceneOptions(data, images, resolution, white_background, chosen)}
+        data, images, divide, white_background = map(given.pop, names)
+        size = Resolution(divide)
+        return {"scene": SceneOptions(data, images, size, white_background, chosen)}
 
     return bundled(
         gather,

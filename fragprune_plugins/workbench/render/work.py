@@ -15,7 +15,6 @@ from tqdm import tqdm
 
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.hosts.photographs import Resolution
 from fragprune_plugins.workbench.commands import opening
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.options import (
@@ -30,10 +29,10 @@ from fragprune_plugins.workbench.figures.wording import nothing_drawn
 from fragprune_plugins.workbench.models.model import load, writable_folder
 from fragprune_plugins.workbench.ranks import Ranks, joined
 from fragprune_plugins.workbench.render import filming
-from fragprune_plugins.workbench.scenes.cameras import divided, load_cameras
+from fragprune_plugins.workbench.scenes.cameras import load_cameras, sized
 from fragprune_plugins.workbench.scenes.dataset import load_photographs
 from fragprune_plugins.workbench.scenes.generated import Named
-from fragprune_plugins.workbench.scenes.output import cameras_of, trained_size
+from fragprune_plugins.workbench.scenes.output import cameras_of
 
 FPS = 30
 """Frames a second of a film."""
@@ -60,7 +59,7 @@ def render(
     """Do what ``fragprune render`` promises; its options are the arguments."""
     film = out.suffix.lower() == ".mp4"
     _expect_place(out, film=film, shard=shard)
-    cameras, size = _cameras(model, cameras, scene, orbit=orbit)
+    cameras, scene = _cameras(model, cameras, scene, orbit=orbit)
     rasterizer, device = opening.open_engine(engine)
     writable_folder(out.parent if film else out)
     filtered, drawing = opening.as_trained(model)
@@ -70,7 +69,7 @@ def render(
         dataset = load_photographs(opening.photographs_for(model, scene))
         named = [(shot.name, shot.view) for shot in opening.chosen(dataset, views)]
     else:
-        named = _views(whole, cameras, size, opening.over_its_background(model, scene), up)
+        named = _views(whole, cameras, opening.over_its_background(model, scene), up)
     if film and not orbit:
         named = filming.along(named, max(FRAMES, len(named)))
     with joined(device) if shard else nullcontext(Ranks()) as ranks:
@@ -139,10 +138,10 @@ def _expect_place(out: Path, *, film: bool, shard: bool) -> None:
 
 def _cameras(
     model: Path, named: Path | None, scene: SceneOptions, *, orbit: bool
-) -> tuple[Path | None, int | Resolution]:
-    """The file of cameras, the training's if none is named, and the size of the pictures."""
+) -> tuple[Path | None, SceneOptions]:
+    """The file of cameras, and the options; the training's cameras and size if none is named."""
     if scene.data is not None or orbit:
-        return None, scene.resolution
+        return None, scene
     if (cameras := named or cameras_of(model)) is None:
         raise UsageError(
             "options",
@@ -150,26 +149,22 @@ def _cameras(
             "cameras to draw from",
             "Pass --cameras FILE, --data FOLDER or --orbit.",
         )
-    trained = named is None and "resolution" not in scene.given
-    return cameras, trained_size(model) if trained else scene.resolution
+    return cameras, scene if named else opening.at_its_size(model, scene)
 
 
 def _views(
-    whole: Model,
-    cameras: Path | None,
-    size: int | Resolution,
-    scene: SceneOptions,
-    up: tuple[float, float, float],
+    whole: Model, cameras: Path | None, scene: SceneOptions, up: tuple[float, float, float]
 ) -> Named:
-    """The named views of a file, or without one those of an orbit; of this size."""
+    """The named views of a file, or without one those of an orbit."""
     if cameras is not None:
         named = load_cameras(cameras, white_background=scene.white_background)
     else:
         background = torch.full((3,), float(scene.white_background))
         orbit = filming.orbit(whole, FRAMES, up)
         named = [(name, replace(view, background=background)) for name, view in orbit]
-    sized = divided(named, size)
-    if isinstance(size, Resolution) and sized[0][1].width != (full := named[0][1].width):
-        said = f"{sized[0][1].width} pixels wide, as in its training; --resolution 1 draws {full}"
+    drawn = sized(named, scene.resolution)
+    width, full = (views[0][1].width for views in (drawn, named))
+    if width != full and "resolution" not in scene.given:
+        said = f"{width} pixels wide, as in its training; --resolution 1 draws {full}"
         click.echo(said, err=True)
-    return sized
+    return drawn

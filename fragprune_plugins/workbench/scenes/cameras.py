@@ -81,9 +81,8 @@ def load_scene_cameras(
     return train, test
 
 
-def divided(views: list[tuple[str, View]], by: int | Resolution) -> list[tuple[str, View]]:
-    """The same views with both sides of their pictures divided, rounded as photographs are."""
-    size = Resolution(divide=by) if isinstance(by, int) else by
+def sized(views: list[tuple[str, View]], size: Resolution) -> list[tuple[str, View]]:
+    """The same views with pictures of the size at which photographs are read."""
     sizes = [size.of(view.width, view.height) for _, view in views]
     return [
         (name, replace(view, width=width, height=height))
