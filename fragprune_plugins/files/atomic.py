@@ -90,6 +90,8 @@ def staging(path: Path) -> Iterator[Path]:
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise OSError("a pipe or device")
         with locked(path) as alone:
             for left in all_in_flight(path, "new-*") if alone else ():
                 shutil.rmtree(left, ignore_errors=True)

@@ -1,6 +1,7 @@
 """Each bad input has one message, exit code 1, and touches nothing that was there."""
 
 import json
+import os
 from itertools import combinations
 
 import pytest
@@ -87,7 +88,10 @@ def test_unwritable_output_is_refused_before_learning(data, path, out, tmp_path,
     folder = tmp_path / "folder.ply"
     folder.mkdir()
     refused(("finetune", path, "--data", data, "--out", folder), "output", "a folder")
+    os.mkfifo(pipe := tmp_path / "pipe.ply")
+    refused(("finetune", path, "--data", data, "--out", pipe), "output", "a pipe")
     assert untouched(out)
+    assert pipe.is_fifo()
 
 
 @pytest.mark.parametrize("command", ["finetune", "export"])

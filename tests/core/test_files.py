@@ -41,10 +41,14 @@ def test_whatever_fails_inside_the_old_file_stays_and_nothing_else_does(tmp_path
     assert list(tmp_path.iterdir()) == [target]
 
 
-def test_a_file_where_a_folder_should_be_is_stated(tmp_path):
+def test_a_file_where_a_folder_should_be_is_stated_and_a_pipe_where_a_file_should(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot be written"), replacing(tmp_path / "file" / "x"):
         pass
+    os.mkfifo(pipe := tmp_path / "pipe")
+    with pytest.raises(OutputError, match=r"\(a pipe or device\)"), replacing(pipe) as new:
+        new.touch()
+    assert pipe.is_fifo()
 
 
 @pytest.mark.parametrize("mask", [0o022, 0o077])

@@ -197,9 +197,9 @@ def require_place(out: Path, model: Path, *, thresholds: bool = True) -> None:
         found = f"{out}, the model's name"
         raise UsageError("--out", found, "another name", "Choose another name.")
     writable_folder(out.parent)
-    if out.is_dir():
-        remedy = "Name a file in the folder."
-        raise OutputError(str(out), "a folder", f"a {form.suffix} file", remedy)
+    if out.exists() and not out.is_file():
+        found = "a folder" if out.is_dir() else "a pipe or device"
+        raise OutputError(str(out), found, f"a {form.suffix} file", "Choose another name.")
 
 
 def describe_written(out: Path, held: str = "", *, pruned: bool = True) -> str:
