@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.constants import NEUTRAL_LOGIT
-from fragprune_plugins.engines import Engine
-from fragprune_plugins.errors import AlignmentError, PluginError, SessionError, UsageError, log
+from fragprune_plugins.errors import AlignmentError, SessionError, UsageError, log
 from fragprune_plugins.hosts.dialect import HostCall
 from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
 from fragprune_plugins.injection.proofs import proved
@@ -27,8 +26,8 @@ from fragprune_plugins.injection.stepping import (
 )
 from fragprune_plugins.learning.area import area_per_pixel
 from fragprune_plugins.learning.goals import Fewer
-from fragprune_plugins.plugins.hooks import thresholds_for
-from fragprune_plugins.types import RasterInputs, RasterOutputs, short
+from fragprune_plugins.plugins.hooks import drawn_by, thresholds_for
+from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 _AMP = "torch.amp" if hasattr(torch.amp, "GradScaler") else "torch.cuda.amp"  # before torch 2.3
 Draw = Callable[[RasterInputs, Tensor | None], RasterOutputs]
@@ -233,16 +232,6 @@ def unpack(session: SessionState, call: HostCall) -> tuple[RasterInputs, Draw]:
     still = rendering is not None and session.standing_still(rendering[0])
     inputs = session.dialect.unpack(replace(call, engine=engine, still=still))
     return inputs, partial(drawn_by, engine)
-
-
-def drawn_by(engine: Engine, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
-    """What an engine draws; raises PluginError if it is no picture."""
-    outputs = engine.rasterize(inputs, thresholds)
-    if not isinstance(outputs, RasterOutputs):
-        where = f"engine {engine.name} of {type(engine).__module__}"
-        remedy = "Fix or uninstall that plugin, or choose another --engine."
-        raise PluginError(where, short(outputs), "RasterOutputs", remedy)
-    return outputs
 
 
 def rasterize(

@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.engines import ENGINES, Engine, create_engine
-from fragprune_plugins.errors import EngineError
+from fragprune_plugins.errors import EngineError, PluginError
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.loading import Plugins, Wrong, installed
-from fragprune_plugins.types import RasterInputs
+from fragprune_plugins.types import RasterInputs, RasterOutputs, short
 
 if TYPE_CHECKING:
     from fragprune_plugins.hosts.findings import Match
@@ -55,6 +55,16 @@ def engine_for(
     return engine
 
 
+def drawn_by(engine: Engine, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
+    """What an engine draws; raises PluginError if it is no picture."""
+    outputs = engine.rasterize(inputs, thresholds)
+    if not isinstance(outputs, RasterOutputs):
+        where = f"engine {engine.name} of {type(engine).__module__}"
+        remedy = "Fix or uninstall that plugin, or choose another --engine."
+        raise PluginError(where, short(outputs), "RasterOutputs", remedy)
+    return outputs
+
+
 def schedule_for(settings: Settings, plugins: Plugins | None = None) -> Schedule:
     """The schedule of stage 2: a plugin's, or ours.
 
@@ -63,8 +73,7 @@ def schedule_for(settings: Settings, plugins: Plugins | None = None) -> Schedule
     """
 
     def wrong(answer: Any) -> Wrong | None:
-        expected = "a schedule: a Schedule, or a subclass of it"
-        return None if isinstance(answer, Schedule) else (repr(answer), expected)
+        return None if isinstance(answer, Schedule) else (repr(answer), "a schedule (Schedule)")
 
     hook = hookspecs.fragprune_create_schedule
     answer = (plugins or installed()).ask(hook, wrong, settings=settings)

@@ -51,15 +51,29 @@ def load(point: EntryPoint, kind: type | tuple[type, ...] = object) -> Any:
     return loaded
 
 
+CODE = (
+    *(AttributeError, NameError, ImportError, TypeError, AssertionError, NotImplementedError),
+    SystemExit,
+)
+"""What faults of code raise, and a file that is read hardly does."""
+
+
 @contextlib.contextmanager
-def blaming(point: EntryPoint, *passing: type[Exception]) -> Iterator[None]:
-    """State what code of an entry point raises, and whose it is. Errors of ours pass, and these."""
+def blaming(
+    point: EntryPoint,
+    *passing: type[Exception],
+    faults: tuple[type[BaseException], ...] = (Exception, SystemExit),
+) -> Iterator[None]:
+    """State what code of an entry point raises, and whose it is.
+
+    Errors of ours pass, those in ``passing``, and what is none of ``faults``.
+    """
     ours: tuple[type[Exception], ...] = (FragpruneError, *passing)
     try:
         yield
     except ours:
         raise
-    except (Exception, SystemExit) as error:
+    except faults as error:
         owner = _owner(point)
         found = printable(f"{type(error).__name__}: {error}".split("\n", 1)[0])
         expected = f"an object that {owner} offers"

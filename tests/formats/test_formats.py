@@ -296,21 +296,28 @@ def test_every_suffix_has_a_format_and_others_none():
 
 
 def raising(*_):
-    raise KeyError("colours")
+    raise AttributeError("colours")
 
 
-@pytest.mark.parametrize("fault", ["write", "claims"])
+@pytest.mark.parametrize("fault", ["read", "write", "claims"])
 def test_a_plugins_format_that_fails_is_named(fault, tmp_path, monkeypatch):
     path, known = tmp_path / "a.mine.ply", formats.of_suffix(".spz")
     point = EntryPoint("mine.ply", "a_module", formats.GROUP)
+    known = replace(known, claims=lambda path: True)
     broken = replace(known, **{fault: raising})
     monkeypatch.setattr(formats, "offered", lambda group: {"mine.ply": point})
     monkeypatch.setattr(formats, "SUFFIXES", (".ply", ".mine.ply"))
     monkeypatch.setattr(EntryPoint, "load", lambda point: broken)
     formats.of_suffix.cache_clear()
     try:
-        with pytest.raises(PluginError, match=r"mine\.ply: KeyError: 'colours'.*a_module"):
+        path.write_bytes(b"")
+        with pytest.raises(PluginError, match=r"mine\.ply: AttributeError: colours.*a_module"):
             save(path, random_splat(5, 1, 0)) if fault == "write" else load(path)
+        path.write_bytes(b"of another kind")
+        formats.of_suffix.cache_clear()
+        broken = known
+        with pytest.raises(ModelFileError, match="not readable"):
+            load(path)
     finally:
         monkeypatch.undo()
         formats.of_suffix.cache_clear()

@@ -7,9 +7,11 @@ from types import SimpleNamespace
 import pytest
 import scenes
 import torch
+from cli.commands import fails
+from finetune import tiny
 from miniatures.vanilla_3dgs import HOST, joint
 
-from fragprune_plugins import Settings, ThresholdStore
+from fragprune_plugins import Settings, ThresholdStore, save
 from fragprune_plugins.adapting import HostRepo, hookimpl
 from fragprune_plugins.errors import InputError, PluginError, UnknownHostError
 from fragprune_plugins.hosts.choosing import choose
@@ -143,6 +145,23 @@ def test_an_engine_that_gives_no_outputs_is_named(answer, said):
         model = host.model()
         with pytest.raises(PluginError, match=named):
             host.render(host.camera(), model)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "profile a.ply --orbit",
+        "finetune a.ply --self --iters 1 --out b.ply",
+        "audit a.ply --out c",
+        "bench",
+    ],
+)
+def test_an_engine_that_gives_no_outputs_is_named_by_commands(plug, tmp_path, monkeypatch, words):
+    monkeypatch.chdir(tmp_path)
+    save("a.ply", tiny.random_model(8))
+    plug(Mine())
+    named = f"engine mine of {Mine.__module__}: None; expected RasterOutputs"
+    fails(*words.split(), "--engine", "mine", says=named, code=1)
 
 
 def test_of_two_engines_of_one_name_the_one_that_draws_is_told(caplog):

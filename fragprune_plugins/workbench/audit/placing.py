@@ -18,6 +18,7 @@ from torch import Tensor
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.files.model import Model
+from fragprune_plugins.plugins.hooks import drawn_by
 from fragprune_plugins.types import RasterInputs, Splats, View
 from fragprune_plugins.workbench.figures.evaluate import bar
 from fragprune_plugins.workbench.scenes.generated import Named, around, bounds, within
@@ -112,7 +113,7 @@ def _detail(engine: Engine, splats: Splats, view: View) -> float:
     Backs of walls and haze show little, and so does a corner of an object.
     """
     view = _small(view).to(splats.device)
-    out = engine.rasterize(RasterInputs(view, splats), None)
+    out = drawn_by(engine, RasterInputs(view, splats), None)
     image = out.image.clamp(0, 1)
     differ = sum(float(image.diff(dim=dim).abs().mean()) for dim in (1, 2))
     return differ * float(out.alpha.mean())
@@ -156,7 +157,7 @@ def enclosed(engine: Engine, splats: Splats, place: Tensor, near: float) -> floa
 
 def _met(engine: Engine, splats: Splats, view: View, near: float) -> Tensor:
     """(P,) 1 where a pixel shows something opaque beyond a distance, else 0; on the CPU."""
-    out = engine.rasterize(RasterInputs(view.to(splats.device), splats), None)
+    out = drawn_by(engine, RasterInputs(view.to(splats.device), splats), None)
     return ((out.alpha > _OPAQUE) & (out.alpha > near * out.invdepth)).flatten().float().cpu()
 
 

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.cpu import binding
+from fragprune_plugins.plugins.hooks import drawn_by
 from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View, one_line
 from fragprune_plugins.workbench.bench.scene import make_scene, make_view
 from fragprune_plugins.workbench.figures.clock import standard_error, synchronize, timed
@@ -137,7 +138,7 @@ def _prepare(case: Case, engine: Engine) -> Callable[[], RasterOutputs]:
     """Make a function that draws once, optionally with gradients of a fixed random loss."""
     inputs = RasterInputs(case.view, case.splats, planes=(), **case.rules)
     if case.kind == "forward":
-        return torch.no_grad()(partial(engine.rasterize, inputs, case.thresholds))
+        return torch.no_grad()(partial(drawn_by, engine, inputs, case.thresholds))
     names = ("means", "opacities", "scales", "rotations", "sh")
     leaves = {n: getattr(case.splats, n).detach().clone().requires_grad_(True) for n in names}
     hook = torch.zeros(len(case.splats), 3, device=case.device, requires_grad=True)
@@ -152,7 +153,7 @@ def _prepare(case: Case, engine: Engine) -> Callable[[], RasterOutputs]:
     def draw_and_differentiate() -> RasterOutputs:
         for leaf in (*leaves.values(), hook, *([] if thresholds is None else [thresholds])):
             leaf.grad = None
-        outputs = engine.rasterize(inputs, thresholds)
+        outputs = drawn_by(engine, inputs, thresholds)
         torch.autograd.backward(outputs.image, weight)
         return outputs
 

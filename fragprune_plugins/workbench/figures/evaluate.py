@@ -18,7 +18,7 @@ from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import EngineError, InputError
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.area import SQUARED_RADIUS
-from fragprune_plugins.plugins.hooks import engine_for, thresholds_for
+from fragprune_plugins.plugins.hooks import drawn_by, engine_for, thresholds_for
 from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View, one_line
 from fragprune_plugins.workbench.figures.clock import Made, standard_error, timed
 from fragprune_plugins.workbench.figures.extents import covered
@@ -69,11 +69,10 @@ class Candidate:
     def draw(self, engine: Engine, view: View, *, counts: bool = False) -> RasterOutputs:
         """Draw one view, optionally with counts of fragments."""
         inputs = replace(self.inputs(view), counts=counts)
-        outputs = engine.rasterize(inputs, self.thresholds(inputs))
-        size = tuple(getattr(getattr(outputs, "image", None), "shape", ()))
+        outputs = drawn_by(engine, inputs, self.thresholds(inputs))
+        size = tuple(getattr(outputs.image, "shape", ()))
         if size != (3, view.height, view.width):  # a plugin's engine may give anything
-            found = f"{type(outputs).__name__} with an image of shape {size}"
-            expected = f"RasterOutputs with (3, {view.height}, {view.width})"
+            found, expected = f"an image of shape {size}", f"(3, {view.height}, {view.width})"
             raise EngineError(f"engine {engine.name}", found, expected, "Choose another --engine.")
         if wrong := int(outputs.image.isnan().any(dim=0).sum()):
             found = f"NaN in {wrong} of {view.width * view.height} pixels"

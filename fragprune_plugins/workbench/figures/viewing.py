@@ -15,7 +15,7 @@ from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import InputError
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.thresholds import ThresholdStore
-from fragprune_plugins.plugins.hooks import engine_for, thresholds_for
+from fragprune_plugins.plugins.hooks import drawn_by, engine_for, thresholds_for
 from fragprune_plugins.types import RasterInputs, RasterOutputs, View, check_tensor
 from fragprune_plugins.workbench.figures.pictures import picture
 from fragprune_plugins.workbench.models import model as models
@@ -144,7 +144,7 @@ def rasterize(
     if own is not None and not ((own >= 0) & (own <= 1)).all():
         remedy = "Pass exp(-q / 2) of a cutoff q."
         raise InputError("thresholds", "numbers outside [0, 1]", "falloffs", remedy)
-    return engine_for(engine, inputs.splats.device).rasterize(inputs, thresholds)
+    return drawn_by(engine_for(engine, inputs.splats.device), inputs, thresholds)
 
 
 def _of_model(model: Any, view: Any) -> tuple[RasterInputs, ThresholdStore | None]:

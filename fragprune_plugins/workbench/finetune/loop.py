@@ -24,7 +24,7 @@ from fragprune_plugins.learning.events import Progress, StepStats
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins import hookspecs
-from fragprune_plugins.plugins.hooks import thresholds_for
+from fragprune_plugins.plugins.hooks import drawn_by, thresholds_for
 from fragprune_plugins.plugins.loading import installed
 from fragprune_plugins.types import RasterInputs, RasterOutputs, one_line
 from fragprune_plugins.workbench.finetune.faster import FrameTarget, require_reach
@@ -322,7 +322,7 @@ class Training:
         thresholds = self.stage.thresholds(inputs)
 
         shown = self.stage.dropped(inputs)
-        outputs, plain = self.engine.rasterize(shown, thresholds), None
+        outputs, plain = drawn_by(self.engine, shown, thresholds), None
         if self._plain_first and self.processes.divided:  # another may need it, and all draw then
             plain = self._plain(inputs)
 
@@ -336,7 +336,7 @@ class Training:
     @torch.no_grad()
     def _plain(self, inputs: RasterInputs) -> RasterOutputs:
         """Draw without thresholds and stop."""
-        return self.engine.rasterize(replace(inputs, stop=None), None)
+        return drawn_by(self.engine, replace(inputs, stop=None), None)
 
 
 def order(

@@ -22,7 +22,7 @@ from fragprune_plugins.constants import NEAR
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.plugins.hooks import engine_for
+from fragprune_plugins.plugins.hooks import drawn_by, engine_for
 from fragprune_plugins.types import RasterInputs, View, one_line
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
@@ -246,7 +246,7 @@ def own_pictures(
     @torch.no_grad()
     def draw(view: View) -> Tensor:
         inputs = RasterInputs(view, splats, planes=(), **model.rules)
-        return drawer.rasterize(inputs, thresholds).image
+        return drawn_by(drawer, inputs, thresholds).image
 
     views = around(model, seed=seed) if cameras is None else cameras
     if held_out is None:

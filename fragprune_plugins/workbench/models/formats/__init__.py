@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, BinaryIO
 
 from fragprune_plugins.errors import ModelFileError, OutputError, PluginError
 from fragprune_plugins.files.reading import Reading, UntrustedFile
-from fragprune_plugins.plugins.points import blaming, load, offered
+from fragprune_plugins.plugins.points import CODE, blaming, load, offered
 
 if TYPE_CHECKING:
     from fragprune_plugins.files.model import Model
@@ -82,9 +82,11 @@ def of_suffix(suffix: str) -> Format:
         return PLY
     point = offered(GROUP)[suffix.removeprefix(".")]
     form: Format = load(point, Format)
-    # Of what ``read`` raises a file may be the cause; it is stated there.
+    # Of what else ``read`` raises a file may be the cause; of ours always. It is stated there.
+    ours = point.value.startswith("fragprune_plugins.")
+    read = form.read if ours else blaming(point, faults=CODE)(form.read)
     write = blaming(point, ValueError, OSError, MemoryError)(form.write)
-    return replace(form, write=write, claims=blaming(point)(form.claims))
+    return replace(form, read=read, write=write, claims=blaming(point)(form.claims))
 
 
 def named(path: Path) -> Format:
