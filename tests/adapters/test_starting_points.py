@@ -72,6 +72,7 @@ def test_results_do_not_compound_run_after_run_which_says_what_it_takes(out, sta
         assert (out / ply(17)).read_bytes() == first
         assert not (out / ply(24)).exists()
     assert (out / "chkpnt13.pth").exists()
+    assert f"iteration 10, {out / 'chkpnt10.pth'}:" in started(out, 17)  # as long as the result
 
 
 def test_after_a_control_stage_two_starts_where_the_control_did(out, started):
