@@ -1,5 +1,7 @@
 """2D Gaussian Splatting: surfels and their maps, on a miniature of the host."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from cli.commands import run_json
@@ -84,9 +86,13 @@ def test_we_measure_the_picture_that_the_hosts_own_script_renders(mini, trained,
     check_measured(summary, picture, photographs, read)
 
 
-def test_compare_draws_its_models_by_their_record(trained):
+@pytest.mark.parametrize("first", [0, 1], ids=["stage 2", "joint"])
+def test_compare_draws_its_models_by_a_record_of_the_host(trained, first):
+    """Where thresholds learned within a training, the record names no model of before."""
     summary, _, _ = trained
-    records.leave(summary.model_after, "run", {"photographs": photographs_of(summary).as_dict()})
+    read = photographs_of(summary)
+    said = replace(read, models=read.models[first:]).as_dict()
+    records.leave(summary.model_after, "run", {"photographs": said})
     found = run_json("compare", summary.model_before, summary.model_after)
     assert found["b"]["fragments_per_pixel"] < found["a"]["fragments_per_pixel"]
 

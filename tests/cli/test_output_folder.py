@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -294,6 +295,24 @@ def test_a_model_is_drawn_by_a_record_that_was_copied_before_it(
     assert records.beside(near)
     model.write_bytes(model.read_bytes() + b"\0")
     assert not records.beside(near)
+
+
+def test_a_training_without_a_record_is_compared_as_the_other_one_was_drawn(
+    output, data, tmp_path, caplog
+):
+    """A host's arguments do not tell. Others are drawn as stored, or as their own run says."""
+    other = newest_model(shutil.copytree(output, tmp_path / "other"))
+    said = records.Recorded(Photographs(data), (other,), drawing={"compensation": "antialiasing"})
+    records.leave(other, "run", {"photographs": said.as_dict()})
+    mine = shutil.copy(newest_model(output), tmp_path / "mine.ply")
+    begun = newest_model(shutil.copytree(output, tmp_path / "begun"))
+    later = shutil.copy(begun, tmp_path / "begun" / "later.ply")
+    known = records.Recorded(Photographs(data), (begun, later), filtered=True)
+    records.leave(later, "run", {"photographs": known.as_dict()})
+    changes = [run_json("compare", each, other)["psnr_change"] for each in (output, mine, begun)]
+    assert changes[0] == 0 != changes[1] == changes[2]
+    (warned,) = [each.message for each in caplog.records if "no record" in each.message]
+    assert f"{newest_model(output)} has no record" in warned
 
 
 def test_a_record_that_says_nothing_of_its_result_is_believed_by_its_time_alone(tmp_path):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from fragprune_plugins.errors import UsageError
+from fragprune_plugins.errors import UsageError, printable
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.types import View
 from fragprune_plugins.workbench.commands import opening
@@ -17,8 +18,10 @@ from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
 from fragprune_plugins.workbench.figures.matching import hardly_shown, told_or_matched
 from fragprune_plugins.workbench.figures.pictures import leave_panels
 from fragprune_plugins.workbench.models.model import load, writable_folder
-from fragprune_plugins.workbench.scenes.output import trained_on
+from fragprune_plugins.workbench.scenes.output import output_folder, trained_on
 from fragprune_plugins.workbench.scenes.training import exposures_left_out
+
+log = logging.getLogger(__name__)
 
 
 def compare(
@@ -47,9 +50,9 @@ def compare(
     candidates = []
     for path in (a, b):
         how = known.get(path)
-        filtered, drawing = (how.filtered, {} if own else how.drawing) if how else (False, {})
+        filtered, drawing = (how.filtered, how.drawing) if how else opening.as_trained(path)
         model = load(path, truncation=not no_truncation, filtered=filtered, device=device)
-        candidates.append(Candidate(model, drawing))
+        candidates.append(Candidate(model, {} if own else drawing))
     if own is not None:
         dataset, shown = own.pictures(candidates[0].model, rasterizer), "A's own"
     else:
@@ -99,13 +102,24 @@ def _lines(report: dict[str, Any], shown: str, views: Sequence[View]) -> list[st
 
 
 def _records(*models: Path) -> dict[Path, records.Recorded]:
-    """By model, what the record of the command that wrote it says, if there is one."""
+    """By model, what the record of the command that wrote it says, if there is one.
+
+    A host's own model may have none: that of the model it is compared with holds for both.
+    """
     known: dict[Path, records.Recorded] = {}
     for model in models:
         record = records.beside(model)
         if record and (read := records.recorded(record)):
             known[model] = read
-            known |= {other: read for other in models if other.resolve() == read.models[0]}
+    if len(known) == 1:
+        (read,) = known.values()
+        for model in set(models) - known.keys():
+            began = model.resolve() == read.models[0]
+            if began or (output_folder(model) and not opening.as_trained(model)[0]):
+                known[model] = read
+            if read.drawing and known.get(model) and not began:
+                said = "%s has no record of how it was drawn, and is drawn as the other model was"
+                log.warning(said, printable(str(model)))
     return known
 
 
