@@ -15,7 +15,7 @@ from fragprune_plugins.hosts import preflight
 from fragprune_plugins.hosts.adapter import HostAdapter, ScriptAdapter
 from fragprune_plugins.hosts.choosing import choose, locate, usage
 from fragprune_plugins.hosts.source import HostRepo
-from fragprune_plugins.injection import process, ranks
+from fragprune_plugins.injection import process, ranks, starting
 from fragprune_plugins.injection.command import HostCommand, split
 from fragprune_plugins.injection.options import RunOptions, RunSummary
 from fragprune_plugins.injection.stages import Stages
@@ -69,6 +69,8 @@ def run(command: list[str], options: RunOptions | None = None) -> RunSummary:
         stages = Stages(host, repo, trainer, plugins, options, device, Path(scratch))
         named = {"off": stages.observe, "joint": stages.joint, "finetune": stages.finetune}
         named.get(options.stage if trains else "off", stages.train_then_finetune)()
+        if trains and own == "run":
+            starting.forget(host)
         own = str(host.flags.config or "") if host.line.config else ""
         for kept in stages.output.glob("cfg_args") if own and stages.output else ():
             with replacing(kept) as new:

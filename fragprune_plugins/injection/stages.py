@@ -92,9 +92,7 @@ class Stages:
         if self.start is None:
             self.start = self._train()
             starting.remember(self.start, self.host, self.repo.commit)
-        command = self.host
         self.finetune()
-        starting.forget(command)
 
     def _train(self) -> Start:
         """Run stage 1; returns its end."""

@@ -340,12 +340,14 @@ def interrupted(host, tmp_path):
     return words, out, caught.value
 
 
-def test_after_ctrl_c_in_stage_two_the_same_command_does_not_repeat_stage_one(interrupted):
+@pytest.mark.parametrize("stage", ["auto", "finetune"])
+def test_after_ctrl_c_in_stage_two_stage_one_is_not_repeated(interrupted, stage):
     words, out, error = interrupted
     checkpoint = out / "chkpnt12345.pth"
     assert error.remedy == f"Run the command again: stage 2 begins anew from {checkpoint}."
     stage_two = f"17346 [] {checkpoint}"
-    run(words, AUTO)
+    named = ["--start_checkpoint", str(checkpoint)] if stage == "finetune" else []
+    run([*words, *named], replace(AUTO, stage=stage))
     assert (out / "log").read_text().splitlines() == [stage_two]
     run(words, AUTO)  # both stages are finished by now
     assert (out / "log").read_text().splitlines() == [stage_two, "12345 [12345] None", stage_two]
