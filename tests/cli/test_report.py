@@ -234,17 +234,19 @@ def test_a_loss_that_is_not_known_leaves_a_gap_in_the_curves(out, record, tmp_pa
     assert run_json("report", out)["pictures"] == 1
 
 
+@pytest.mark.parametrize(("keep", "left"), [(None, ""), ("auto", ", counted from what was left")])
 @pytest.mark.parametrize(
     ("goal", "said"), [("pressure", "."), ("control", ": a control, nothing is truncated.")]
 )
-def test_a_run_that_was_not_measured_reports_its_training_views(tmp_path, goal, said):
+def test_a_run_that_was_not_measured_reports_its_training_views(tmp_path, goal, said, keep, left):
     seen = {"fragments_per_pixel_before": 30.0, "fragments_per_pixel_after": 12.0}
     data = {"adapter": "my-host", "iterations": 5, "training_views": seen, "photographs": None}
+    data |= {"keep": keep, "before": None, "gaussians_before": 9, "gaussians": 5 if keep else 9}
     records.leave(tmp_path / "point_cloud.ply", "run", data | {"settings": {"goal": goal}})
     report = run_json("report", tmp_path)
     assert report["result"] == (
-        "my-host, 5 iterations: 2.50x fewer fragments (30.0 -> 12.0 per pixel) on training views; "
-        f"frame times were not measured{said}"
+        "my-host, 5 iterations: 2.50x fewer fragments (30.0 -> 12.0 per pixel) on training views"
+        f"{left}; frame times were not measured{said}"
     )
     page = (tmp_path / "report.html").read_text()
     assert "fragments_per_pixel_" not in page

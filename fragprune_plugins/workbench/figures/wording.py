@@ -194,7 +194,8 @@ def outcome_in_training(data: Mapping[str, Any]) -> str:
     seen = data["training_views"]
     change = fewer(seen["fragments_per_pixel_before"], seen["fragments_per_pixel_after"])
     end = IS_CONTROL if data["settings"]["goal"] == CONTROL else f".{missed(data)}"
-    return f"{change} on training views; frame times were not measured{end}"
+    left = "" if data.get("keep") in (None, 1) else ", counted from what was left"
+    return f"{change} on training views{left}; frame times were not measured{end}"
 
 
 def headlines(data: Mapping[str, Any], control: dict[str, Any] | None) -> list[tuple[str, str]]:
