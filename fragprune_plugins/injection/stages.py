@@ -329,7 +329,7 @@ class Stages:
 
     def _comparison(self) -> tuple[Photographs | None, dict[str, Any], NotComparedError | None]:
         """(photographs, drawing, None) to measure the models, or (None, {}, the reason)."""
-        if not self.learned:
+        if not (self.learned or self.already_finished):
             return None, {}, None
         try:
             drawing = self.adapter.drawing(self.repo, self.host.arguments)

@@ -237,6 +237,12 @@ def test_a_finished_stage_two_says_so_and_runs_nothing(folder):
     text = succeeds("run", *finetune, *words)
     assert "is finished" in text.stdout
     assert f"fragprune compare {models(out)[0]} {result}" in text.stdout
+    (known,) = (each for each in records.find(out) if each.path.parent == result.parent)
+    known.path.unlink()  # as after Ctrl-C while it measures
+    assert run_json("run", *finetune, *words)["after"]["psnr"] == known.data["after"]["psnr"]
+    measured = records.beside(result).data
+    for key in ("iterations", "settings", "gaussians"):
+        assert measured[key] == known.data[key]
     assert result.stat().st_mtime_ns == written
     assert run_json("run", *finetune, "--pressure", 2e-3, *words)["already_finished"] is False
     other = run_json("run", *finetune, "--pressure", 2e-3, *words, "--lambda_dssim", 0.5)

@@ -106,9 +106,12 @@ def run(
             except FragpruneError as error:  # the trained model is saved already
                 not_compared = error
     data = figures_of(summary, settings, looking, before, after, not_compared, host_command)
-    if summary.steps and summary.model_after:
+    if (summary.steps or after) and summary.model_after:
         read = photographs and photographs.as_dict()
         more = {"curves": summary.curves, "photographs": read}
+        if after and not summary.steps:  # a run that was interrupted while it measured
+            more["iterations"] = summary.settings["iterations"]
+            more["gaussians"] = after["gaussians"]
         code = records.leave_or_tell(summary.model_after, "run", data | more)
     return Report(data, _describe(summary, data), code)
 
@@ -269,8 +272,10 @@ def _saved(summary: launch.RunSummary) -> str:
 
 
 def photographs_of(summary: launch.RunSummary) -> records.Recorded | None:
-    """How to read the host's data and draw its models; None if they cannot be measured."""
+    """How to read the host's data and draw its models; None if they cannot be, or are measured."""
     if not summary.photographs or not summary.photographs.held_out:
+        return None
+    if summary.already_finished and summary.model_after and records.beside(summary.model_after):
         return None
     left = tuple(path for path in (summary.model_before, summary.model_after) if path)
     return records.Recorded(summary.photographs, left, filtered=True, drawing=summary.drawing)
