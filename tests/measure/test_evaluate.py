@@ -1,5 +1,6 @@
 """Measuring splats on photographs, and the pictures of it."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import torch
 from finetune import tiny
 from PIL import Image
 
-from fragprune_plugins import finetune, keep_best, keep_needed
+from fragprune_plugins import finetune, keep_best, keep_needed, look_at, own_pictures
 from fragprune_plugins.errors import EngineError, InputError
 from fragprune_plugins.plugins.hooks import engine_for
 from fragprune_plugins.workbench.figures.evaluate import measure
@@ -43,6 +44,18 @@ def test_report_of_the_truth(truth, shots):
     assert report["frame_ms"] > 0
     assert measure(truth, shots, repeats=1)["frame_ms_se"] == 0.0
     assert report["evaluated_per_pixel"] >= report["fragments_per_pixel"] > 0
+
+
+def test_one_view_of_nothing_does_not_make_pictures_equal(truth):
+    near, other = tiny.cameras()[0].view(), tiny.perturbed(truth)
+    away = look_at(eye=(0, 0, -5), target=(0, 0, -9), width=tiny.SIDE, height=tiny.SIDE)
+    named = [("near", near), ("away", away)]
+
+    def against_itself(model, held_out):
+        return measure(model, own_pictures(truth, named, held_out), repeats=1)["psnr"]
+
+    assert against_itself(other, named) == against_itself(other, named[:1]) < 60
+    assert against_itself(other, named[1:]) == against_itself(truth, named) == math.inf
 
 
 def test_nothing_to_measure_learn_or_judge_by_is_stated(truth, shots):

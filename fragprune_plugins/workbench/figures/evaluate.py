@@ -22,7 +22,7 @@ from fragprune_plugins.plugins.hooks import drawn_by, engine_for, thresholds_for
 from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View, one_line
 from fragprune_plugins.workbench.figures.clock import Made, standard_error, timed
 from fragprune_plugins.workbench.figures.extents import covered
-from fragprune_plugins.workbench.figures.metrics import lpips, psnr, ssim
+from fragprune_plugins.workbench.figures.metrics import lpips, mean, psnr, ssim
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.ranks import launched
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
@@ -100,11 +100,12 @@ def measure(
         repeats: number of timed frames for each view.
 
     Returns:
-        target ("photographs", or "itself" for a model's own pictures), psnr (dB; infinite against
-        itself), ssim, lpips (None where not installed), fragments_per_pixel, evaluated_per_pixel,
-        entries_per_pixel (NaN from an engine that does not count them), area_per_pixel
-        (``covered_per_pixel``), gaussians, frame_ms (median over views and repeats), frame_ms_se
-        (standard error over repeats of the median over views), engine, device, views.
+        target ("photographs", or "itself" for a model's own pictures), psnr (dB; equal views
+        count only where all are equal: infinite), ssim, lpips (None where not installed),
+        fragments_per_pixel, evaluated_per_pixel, entries_per_pixel (NaN from an engine that does
+        not count them), area_per_pixel (``covered_per_pixel``), gaussians, frame_ms (median over
+        views and repeats), frame_ms_se (standard error over repeats of the median over views),
+        engine, device, views.
 
     Raises:
         EngineError: no such engine here.
@@ -193,7 +194,7 @@ def bar(items: Sequence[Made], what: str) -> Iterable[Made]:
 
 def _mean(values: Sequence[float | None]) -> float | None:
     known = [value for value in values if value is not None]
-    return statistics.fmean(known) if len(known) == len(values) else None
+    return mean(known) if len(known) == len(values) else None
 
 
 @torch.no_grad()

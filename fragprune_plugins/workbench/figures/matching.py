@@ -14,7 +14,7 @@ from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.learning.stage2 import evenly_spaced
 from fragprune_plugins.workbench.figures.evaluate import Candidate, psnrs
-from fragprune_plugins.workbench.figures.metrics import psnr
+from fragprune_plugins.workbench.figures.metrics import mean, psnr
 from fragprune_plugins.workbench.scenes.dataset import OFF_CENTRE, Dataset, Shot, load_photographs
 
 OTHER_SCENE = 3.0
@@ -60,7 +60,7 @@ def told_or_matched(model: Model, read: Photographs, engine: Engine) -> tuple[Ph
 
 def shown(model: Model, dataset: Dataset, engine: Engine) -> float:
     """How well a model shows up to eight training pictures, dB of PSNR."""
-    return statistics.fmean(psnrs(Candidate(model), evenly_spaced(dataset.train, 8), engine)[0])
+    return mean(psnrs(Candidate(model), evenly_spaced(dataset.train, 8), engine)[0])
 
 
 def shown_and_plain(model: Model, dataset: Dataset, engine: Engine) -> tuple[float, float]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
+import statistics
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -24,6 +26,11 @@ def psnr(image: Tensor, target: Tensor) -> float:
     """Peak signal-to-noise ratio, dB, data range 1; infinite for equal images (3, H, W)."""
     mse = (image.clamp(0, 1) - target.clamp(0, 1)).square().mean().double()
     return float(-10 * mse.log10())
+
+
+def mean(figures: Sequence[float]) -> float:
+    """The mean over views; infinite PSNR, as of views of nothing, counts only where all have it."""
+    return statistics.fmean([each for each in figures if each < math.inf] or figures)
 
 
 def ssim(image: Tensor, target: Tensor) -> float:

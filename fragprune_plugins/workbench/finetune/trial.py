@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -12,6 +11,7 @@ from fragprune_plugins.learning.goals import Control, Fewer, Pressure
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.stage2 import evenly_spaced
 from fragprune_plugins.workbench.figures.evaluate import Candidate, psnrs
+from fragprune_plugins.workbench.figures.metrics import mean
 from fragprune_plugins.workbench.finetune.loop import Training
 from fragprune_plugins.workbench.finetune.processes import Processes
 from fragprune_plugins.workbench.goals import AtMost, Faster
@@ -106,7 +106,5 @@ def forgotten(
     training.learn(progress=False)
     other = training.result_model()
     training.end()
-    before, after = (
-        statistics.fmean(psnrs(Candidate(each), others, engine)[0]) for each in (model, other)
-    )
+    before, after = (mean(psnrs(Candidate(each), others, engine)[0]) for each in (model, other))
     return before - after
