@@ -43,17 +43,19 @@ class ThresholdStore:
     Attributes:
         stop: the model's, as ``RasterInputs`` has it; None for the hosts' rule. It is not learned.
         rim: the model's, as ``RasterInputs`` has it. It is not learned.
+        adam: the state of Adam that the logits have, by its names; {} before the first step.
     """
 
     def __init__(self, count: int, device: torch.device | str = "cpu", lr: float = 0.05) -> None:
         self.steps = 0
         self.stop: float | None = None
         self.rim: Rim = "hard"
-        self._bind(torch.full((count,), NEUTRAL_LOGIT, device=device), lr)
+        self.lr = lr
+        self._bind(torch.full((count,), NEUTRAL_LOGIT, device=device))
 
-    def _bind(self, logits: Tensor, lr: float) -> None:
+    def _bind(self, logits: Tensor, adam: dict[str, Any] | None = None) -> None:
         self.logits = logits.detach().to(torch.float32, copy=True).requires_grad_(True)
-        self.optimizer = torch.optim.Adam([self.logits], lr=lr, eps=EPSILON)
+        self.adam = adam or {}
         # known of the logits: whether all are neutral, and whether none is; thresholds as given
         self._seen: _Noted[tuple[bool, bool]] | None = None
         self._given: _Noted[Tensor] | None = None
@@ -173,8 +175,7 @@ class ThresholdStore:
     @property
     def opened(self) -> bool:
         """True if ``open`` would change nothing, because it was called and no row is neutral."""
-        seen = self._known(self._seen)
-        return seen is not None and seen[1]
+        return self._look()[1]
 
     def open(self, opacities: Tensor) -> None:
         """Start learning: neutral rows move to just below the skip limit 1/(255 o).
@@ -198,11 +199,13 @@ class ThresholdStore:
 
     def step(self, lr: float | None = None) -> None:
         """Make one optimizer step with the gradient gathered since the last one, and clear it."""
-        if lr is not None:
-            self.optimizer.param_groups[0]["lr"] = lr
+        self.lr = self.lr if lr is None else lr
         neutral, opened = self._look()
-        self.optimizer.step()
-        self.optimizer.zero_grad(set_to_none=True)
+        # Made only here: for the first one torch takes a second, and drawing needs none.
+        optimizer = torch.optim.Adam([self.logits], lr=self.lr, eps=EPSILON)
+        optimizer.state[self.logits] = self.adam
+        optimizer.step()
+        optimizer.zero_grad(set_to_none=True)
         self.place(self.logits)
         self.steps += 1
         if not neutral:  # no step comes near the 24 logits from the skip limit down to neutral
@@ -216,7 +219,7 @@ class ThresholdStore:
     def clone(self, device: torch.device | str | None = None) -> ThresholdStore:
         """A copy with its moments, on a device; on its own when None."""
         device = self.logits.device if device is None else device
-        other = ThresholdStore(0, device, self.optimizer.param_groups[0]["lr"])
+        other = ThresholdStore(0, device, self.lr)
         other.load_state_dict(self.state_dict())
         if (given := self._known(self._given)) is not None:
             other._given = other._note(given.to(other.logits.device))
@@ -261,30 +264,26 @@ class ThresholdStore:
         """
         origins = self._rows(origins, len(fresh), "rearrange")
         self._resize(lambda rows: rows[origins])
-        if state := self.optimizer.state.get(self.logits):
-            for name in _MOMENTS:
-                state[name][fresh] = 0
+        for name in _MOMENTS.keys() & self.adam:
+            self.adam[name][fresh] = 0
 
     def replace(self, count: int) -> None:
         """Start over for another population: ``count`` neutral rows with zero moments."""
-        lr = self.optimizer.param_groups[0]["lr"]
-        self._bind(torch.full((count,), NEUTRAL_LOGIT, device=self.logits.device), lr)
+        self._bind(torch.full((count,), NEUTRAL_LOGIT, device=self.logits.device))
 
     @property
     def numbers(self) -> dict[str, Tensor]:
         """All learned tensors, each (N,), by a name for messages."""
-        state = self.optimizer.state.get(self.logits, {})
-        named = {said: state[name] for name, said in _MOMENTS.items() if name in state}
+        named = {said: self.adam[name] for name, said in _MOMENTS.items() if name in self.adam}
         return {"thresholds": self.logits.detach(), **named}
 
     def state_dict(self) -> dict[str, Any]:
         """Copies of logits, moments and counters, and the ``rules``, for ``load_state_dict``."""
-        state = self.optimizer.state.get(self.logits, {})
         zeros = torch.zeros_like(self.logits)
         return {
             "logits": self.logits.detach().clone(),
-            **{name: state.get(name, zeros).detach().clone() for name in _MOMENTS},
-            "adam_step": float(state.get("step", 0.0)),
+            **{name: self.adam.get(name, zeros).detach().clone() for name in _MOMENTS},
+            "adam_step": float(self.adam.get("step", 0.0)),
             "steps": self.steps,
             **({} if self.stop is None else {"stop": self.stop}),
             **({} if self.rim == "hard" else {"rim": self.rim}),
@@ -314,22 +313,18 @@ class ThresholdStore:
         if not is_rim(rim):
             raise _misfit(f"a rim {rim!r:.40}", "hard or soft")
         self.stop, self.rim = stop, rim
-        device, lr = self.logits.device, self.optimizer.param_groups[0]["lr"]
-        self._bind(rows["logits"].to(device), lr)
+        device = self.logits.device
+        self._bind(rows["logits"].to(device))
         self.steps = int(state["steps"])
         if state["adam_step"] > 0:
             step = torch.tensor(float(state["adam_step"]), dtype=torch.float32)
-            moments = {name: rows[name].to(device).clone() for name in _MOMENTS}
-            self.optimizer.state[self.logits] = {"step": step, **moments}
+            self.adam = {"step": step} | {n: rows[n].to(device).clone() for n in _MOMENTS}
 
     def _resize(self, change: Callable[[Tensor], Tensor]) -> None:
         """Apply a row operation to logits and moments alike."""
-        old, given = self.optimizer.state.get(self.logits), self._known(self._given)
-        lr = self.optimizer.param_groups[0]["lr"]
-        self._bind(change(self.logits.detach()), lr)
-        if old:
-            moments = {name: change(old[name]) for name in _MOMENTS}
-            self.optimizer.state[self.logits] = {"step": old["step"], **moments}
+        given = self._known(self._given)
+        moments = {name: change(self.adam[name]) for name in _MOMENTS.keys() & self.adam}
+        self._bind(change(self.logits.detach()), self.adam | moments)
         if given is not None:
             self._given = self._note(change(given))
 

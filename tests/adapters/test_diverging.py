@@ -25,7 +25,7 @@ def test_a_host_is_not_let_save_what_is_not_finite(tmp_path, what, value):
             "opacity": model._opacity,
             "scaling": model._scaling,
             "thresholds": store.logits,
-            "moments": store.optimizer.state[store.logits]["exp_avg"],
+            "moments": store.adam["exp_avg"],
         }[what]
         spoil(spoiled, 3, value)
         file = tmp_path / "point_cloud.ply"

@@ -104,6 +104,17 @@ def test_loading_every_plugin_imports_no_torch(python):
     ) == [True, False]
 
 
+def test_to_draw_with_cutoffs_imports_no_compiler(python):
+    """torch takes a second for it, and asks for it where an optimizer is made."""
+    assert python(
+        "import json, sys, torch\n"
+        "import fragprune_plugins as fp\n"
+        "store = fp.ThresholdStore.from_falloff(torch.tensor([0.1, 0.2])).clone()\n"
+        "store.keep(torch.tensor([True, False]))\n"
+        "print(json.dumps([len(store), 'torch._dynamo' in sys.modules]))"
+    ) == [1, False]
+
+
 def test_import_rules_hold():
     program = shutil.which("lint-imports", path=str(Path(sys.executable).parent))
     if program is None:
