@@ -135,6 +135,8 @@ def test_comparisons_come_along_with_their_pictures(out, data):
         assert all(f"<h2>{heading}: {view}</h2>" in page for view in views)
     alone = run_json("report", out / "pictures")
     assert (alone["command"], alone["views"]) == ("compare", [])
+    said = "../pruned.ply with cutoffs, against itself without cutoffs: "
+    assert run_json("report", out / "more")["result"].startswith(said)
 
 
 def test_without_the_photographs_there_are_curves_and_the_reason(out, data, record, tmp_path):

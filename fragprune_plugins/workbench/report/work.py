@@ -145,6 +145,9 @@ def _sentence(record: Record, among: Sequence[Path]) -> str:
         return of + wording.outcome(record.command, data, control)
     if record.command == "compare":
         of = f"A is {data['a']['model']}, B is {data['b']['model']}: "
+    elif len(columns) > 1:  # of a profile
+        without, drawn = _columns(record)
+        of = f"{data['model']} {drawn}, against itself {without}: "
     if len(columns) > 1:
         return f"{of}{wording.gain(columns[0], columns[-1], data.get('enlarge', 1))}."
     if columns:
