@@ -258,10 +258,11 @@ def test_two_images_of_one_stem_are_not_guessed_between(colmap):
         load_dataset(colmap)
 
 
-def test_the_right_folder_is_named_where_another_was_given(tmp_path, images):
+def test_the_right_folder_is_named_where_another_was_given(tmp_path, images, monkeypatch):
     scene = tiny.write_colmap(tmp_path / "scene", images)
-    for wrong in (scene / "images", tmp_path):
-        with pytest.raises(DatasetError, match=f"neither layout.*Pass {scene}"):
+    monkeypatch.chdir(scene / "images")
+    for wrong in (scene / "images", tmp_path, Path()):
+        with pytest.raises(DatasetError, match=rf"neither layout.*Pass {scene}\.$"):
             load_dataset(wrong)
 
 

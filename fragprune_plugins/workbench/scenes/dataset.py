@@ -349,10 +349,10 @@ def read_scene(folder: Path, images: str = "images") -> tuple[list[Posed], list[
     DatasetError as of ``load_dataset``.
     """
     if not os.path.isdir(folder):  # False for a name that no folder can have, too
-        file = os.path.isfile(folder)
-        found, remedy = ("a file", f"Pass {folder.parent}.") if file else ("no such folder", "")
-        expected = "a folder with photographs"
-        raise DatasetError(str(folder), found, expected, remedy or "Check --data.")
+        found, remedy = "no such folder", "Check --data."
+        if os.path.isfile(folder):
+            found, remedy = "a file", f"Pass {folder.resolve().parent}."
+        raise DatasetError(str(folder), found, "a folder with photographs", remedy)
     model = colmap.find_model(folder)
     known = transforms.has_transforms(folder)
     if model is not None and known and model != folder / colmap.NERFSTUDIOS:
@@ -375,7 +375,8 @@ def read_scene(folder: Path, images: str = "images") -> tuple[list[Posed], list[
 
 def _where_else(folder: Path) -> str:
     """What to do about a folder that is no scene."""
-    for other in (folder.parent, *sorted(each for each in folder.iterdir() if each.is_dir())):
+    inside = sorted(each for each in folder.iterdir() if each.is_dir())
+    for other in (folder.resolve().parent, *inside):
         if colmap.find_model(other) is not None or transforms.has_transforms(other):
             return f"Pass {other}."
     if parts := colmap.others(folder):
