@@ -434,11 +434,10 @@ class RasterInputs:
     __repr__ = one_line
 
     def __post_init__(self) -> None:
-        size = self.view.height, self.view.width
-        check_fields(self, means2d_hook=(len(self.splats), None), sample_offsets=(*size, 2))
         highest = 1 if self.stop is None else STOPPED_ALPHA_MAX
         check_values(
             self,
+            view=(isinstance(self.view, View), "a View, such as the .view of a photograph"),
             compensation=(self.compensation in get_args(Compensation), get_args(Compensation)),
             near=(self.near >= 0, "0 or more"),
             stop=(is_stop(self.stop), "None, or 1e-4 to 1"),
@@ -446,6 +445,8 @@ class RasterInputs:
             alpha_max=(ALPHA_MIN <= self.alpha_max <= highest, f"1/255 to {highest}"),
             planes=(set(self.planes) <= set(get_args(Plane)), f"of {get_args(Plane)}"),
         )
+        size = self.view.height, self.view.width
+        check_fields(self, means2d_hook=(len(self.splats), None), sample_offsets=(*size, 2))
         self._check_surfels()
         hook = self.means2d_hook
         if self.absolute_gradient and hook is not None and hook.shape[1] < 3:

@@ -107,11 +107,14 @@ class ThresholdStore:
             lr: initial learning rate on the logits.
 
         Raises:
-            InputError: the limit is not in (0, 1).
+            InputError: the limit is not in (0, 1), or an opacity not in [0, 1].
         """
         if not 0 < alpha < 1:
             raise InputError("alpha", f"{alpha:g}", "in (0, 1)", "Choose one, such as 4 / 255.")
         opacities = opacities.detach().reshape(-1)
+        if not bool(((opacities >= 0) & (opacities <= 1)).all()):
+            remedy = "Pass model.splats().opacities."
+            raise InputError("opacities", "some outside [0, 1]", "activated ones", remedy)
         store = cls(len(opacities), opacities.device, lr)
         store.place(torch.logit((alpha / opacities).clamp_max(1.0)))
         return store

@@ -331,3 +331,6 @@ def test_a_limit_of_alpha_is_the_same_alpha_at_every_rim():
     for none in (0.0, 1.0, math.nan):
         with pytest.raises(InputError):
             ThresholdStore.from_alpha(none, opacities)
+    for logits in (-opacities, 2 * opacities, math.nan * opacities):
+        with pytest.raises(InputError, match="activated"):
+            ThresholdStore.from_alpha(0.04, logits)

@@ -9,7 +9,7 @@ import torch
 from finetune import tiny
 from PIL import Image
 
-from fragprune_plugins import finetune, keep_best, keep_needed, look_at, own_pictures
+from fragprune_plugins import finetune, keep_best, keep_needed, look_at, own_pictures, render_view
 from fragprune_plugins.errors import EngineError, InputError
 from fragprune_plugins.plugins.hooks import engine_for
 from fragprune_plugins.workbench.figures.evaluate import measure
@@ -77,6 +77,9 @@ def test_what_is_no_data_set_or_settings_is_named(truth, shots):
         finetune(truth, "path")
     with pytest.raises(InputError, match="finetune settings: 3; expected a Settings"):
         finetune(truth, Dataset(shots, shots), 3)
+    for use in (lambda: render_view(truth, shots[0]), lambda: keep_best(truth, 0.5, shots)):
+        with pytest.raises(InputError, match=r"expected a View, .* \.view of a photograph"):
+            use()
 
 
 class Smaller:
