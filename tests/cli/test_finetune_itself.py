@@ -93,3 +93,10 @@ def test_in_python_needs_no_cameras(model):
     image = dataset.test[0].image
     assert image.shape == (3, 800, 800)
     assert float(image.max()) > 0.1
+
+
+def test_settings_follow_from_whose_pictures_they_are(model):
+    """A stop and a pressure for photographs would change what they must not."""
+    views = [(f"view{i}", camera.view()) for i, camera in enumerate(tiny.cameras(3))]
+    result = fp.finetune(model, fp.own_pictures(model, views), fp.Settings(2))
+    assert (result.settings.itself, result.model.stop) == (True, None)

@@ -21,6 +21,7 @@ from fragprune_plugins.workbench.goals import AtMost
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.ranks import Ranks
 from fragprune_plugins.workbench.scenes.dataset import Dataset
+from fragprune_plugins.workbench.scenes.generated import OwnPicture
 
 
 def finetune(
@@ -37,8 +38,8 @@ def finetune(
     """Learn the thresholds of a trained splat on its photographs; portable, its shapes.
 
     Loss: 0.8 L1 + 0.2 (1 - SSIM) + pressure x drawn fragments per pixel; portable, pressure x
-    area of the ellipses per pixel. Views come in seeded
-    random permutations; the global random streams are not touched.
+    area of the ellipses per pixel. Views come in seeded random permutations; the global random
+    streams are not touched.
 
     Args:
         model: what ``load`` gave, the result of another fine-tuning, or a file; not changed.
@@ -46,7 +47,7 @@ def finetune(
             device.
         dataset: its photographs; only training views are learned from. Pixels stay in main memory
             and follow the model one view at a time.
-        settings: iterations, what moves, the goal; defaults when None.
+        settings: iterations, what moves, the goal, or None; ``itself`` follows from the dataset.
         schedule: gives the plan of each step; when None a plugin's, or the default one.
         engine: a name or an engine.
         progress: draw a bar on stderr.
@@ -73,6 +74,8 @@ def finetune(
     engine = engine_for(engine, device)
     _expect_kinds(dataset, settings)
     dataset = dataset.to(device)
+    if isinstance(dataset.train[0], OwnPicture):
+        settings = replace(settings, itself=True)
     goal = settings.goal
     if isinstance(goal, AtMost):
         train = partial(finetune, model, dataset, engine=engine, progress=progress, ranks=ranks)
