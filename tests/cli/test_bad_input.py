@@ -94,6 +94,21 @@ def test_unwritable_output_is_refused_before_learning(data, path, out, tmp_path,
     assert pipe.is_fifo()
 
 
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [((), ("dataset", "view00.png: not readable")), (("--resolution", 4), ("input", "8x8 pixels"))],
+)
+def test_what_cannot_be_measured_is_refused_before_learning(
+    data, path, out, monkeypatch, more, said
+):
+    monkeypatch.setattr("fragprune_plugins.workbench.finetune.api.finetune", None)  # never called
+    if not more:
+        held_out = data / "images" / "view00.png"
+        held_out.write_bytes(held_out.read_bytes()[:-100])
+    refused(("finetune", path, "--data", data, "--out", out, *more), *said)
+    assert untouched(out)
+
+
 @pytest.mark.parametrize("command", ["finetune", "export"])
 def test_the_model_itself_is_no_output(data, path, command):
     write_ply(path, tiny.cut(tiny.random_model(8), 0.3))

@@ -33,6 +33,13 @@ def mean(figures: Sequence[float]) -> float:
     return statistics.fmean([each for each in figures if each < math.inf] or figures)
 
 
+def expect_window(image: Tensor) -> None:
+    """Raise InputError if an image (3, H, W) is smaller than the window of ``ssim``."""
+    if min(image.shape[-2:]) < WINDOW:
+        found = f"an image of {image.shape[-1]}x{image.shape[-2]} pixels"
+        raise InputError("ssim", found, f"at least {WINDOW}x{WINDOW}", "Measure on larger images.")
+
+
 def ssim(image: Tensor, target: Tensor) -> float:
     """Structural similarity by scikit-image, in [-1, 1], of two images (3, H, W).
 
@@ -45,9 +52,7 @@ def ssim(image: Tensor, target: Tensor) -> float:
     """
     from skimage.metrics import structural_similarity
 
-    if min(image.shape[-2:]) < WINDOW:
-        found = f"an image of {image.shape[-1]}x{image.shape[-2]} pixels"
-        raise InputError("ssim", found, f"at least {WINDOW}x{WINDOW}", "Measure on larger images.")
+    expect_window(image)
     first, second = (
         x.detach().clamp(0, 1).permute(1, 2, 0).cpu().double().numpy() for x in (image, target)
     )

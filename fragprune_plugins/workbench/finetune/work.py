@@ -26,6 +26,7 @@ from fragprune_plugins.workbench.distributed import ShardedEngine, part_of, whol
 from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.figures.matching import OTHER_SCENE, matched, shown_and_plain
+from fragprune_plugins.workbench.figures.metrics import expect_window
 from fragprune_plugins.workbench.finetune import api, resuming
 from fragprune_plugins.workbench.finetune.finished import Asked, Finetuned, Opened, finished
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
@@ -62,6 +63,8 @@ def finetune(**options: Any) -> Report | None:
             if ranks.gather(known is not None)[0]:
                 opened.checkpoints.clear()
                 return known
+            for shot in opened.dataset.test:  # what cannot be measured shows before the learning
+                expect_window(shot.image)
             chosen, lost = _tried(opened)
             over, engine = _learned(chosen, ranks, lost)
             measured = None
