@@ -72,12 +72,14 @@ def test_says_what_the_model_is_without_its_thresholds(data, words, out):
         *(("photographs", 30.0, 29.6, False), ("photographs", 30.0, 29.4, True)),
         # the original's own PSNR is infinite: anything is far below, and may still not be seen
         *(("itself", math.inf, 48.3, False), ("itself", math.inf, 34.0, True)),
+        ("itself", math.inf, math.inf, False),
     ],
 )
 def test_a_model_that_other_viewers_draw_badly_says_what_to_do(target, before, psnr, advised):
     plain = {"psnr": psnr, "target": target, "fragments_per_pixel": 9.0}
     line = describe_untruncated({"psnr": before}, plain | {"frame_ms": 1.0, "frame_ms_se": 0.1})
     assert ("--portable" in line) == advised
+    assert ("equal pictures" in line) == (psnr == math.inf) != ("dB" in line)
 
 
 @pytest.mark.parametrize(

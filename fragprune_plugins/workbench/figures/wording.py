@@ -137,7 +137,7 @@ def gain(before: dict[str, Any], after: dict[str, Any], enlarge: int = 1) -> str
     """
     return (
         f"{fewer(before['fragments_per_pixel'], after['fragments_per_pixel'])}, "
-        f"{frames(before, after, enlarge)}, {_quality(before, after)} on {_views(after)}"
+        f"{frames(before, after, enlarge)}, {quality(before, after)} on {_views(after)}"
     )
 
 
@@ -146,7 +146,7 @@ def _views(report: dict[str, Any]) -> str:
     return f"{report['views']} view" + ("" if report["views"] == 1 else "s")
 
 
-def _quality(before: dict[str, Any], after: dict[str, Any]) -> str:
+def quality(before: dict[str, Any], after: dict[str, Any]) -> str:
     """A phrase for what became of the picture."""
     if after.get("target") == ITSELF:
         return "equal pictures" if _same(after) else f"{after['psnr']:.2f} dB PSNR against itself"

@@ -291,12 +291,12 @@ def advise(data: dict[str, Any]) -> str | None:
 def describe_untruncated(before: dict[str, Any], plain: dict[str, Any]) -> str:
     """A line on the fine-tuned model without its cutoffs."""
     own = plain["target"] == "itself"
-    compared = "against itself" if own else f"({plain['psnr'] - before['psnr']:+.2f})"
+    change = f"{plain['psnr']:.2f} dB PSNR ({plain['psnr'] - before['psnr']:+.2f})"
+    shown = wording.quality(before, plain) if own else change
     least = wording.VISIBLE if own else before["psnr"] - wording.FELL
     advice = " For such viewers: --portable." if plain["psnr"] < least else ""
     return (
-        f"In viewers that know no cutoffs: {plain['psnr']:.2f} dB PSNR "
-        f"{compared}, {plain['fragments_per_pixel']:.1f} fragments "
+        f"In viewers that know no cutoffs: {shown}, {plain['fragments_per_pixel']:.1f} fragments "
         f"per pixel, {plain['frame_ms']:.2f} ± {plain['frame_ms_se']:.2f} ms a frame."
         f"{advice}"
     )
