@@ -1,6 +1,7 @@
 """fragprune compare and profile."""
 
 import importlib
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -117,6 +118,18 @@ def test_profile_measures_against_the_models_own_pictures(path, model):
     assert report["target"] == "itself"
     assert report["columns"]["untruncated"]["psnr"] is None
     assert 10 < report["psnr"] < 80
+
+
+def test_a_camera_that_sees_nothing_tells_nothing_of_a_model(path, model, tmp_path):
+    """A picture of one colour equals what it shows, and the colour."""
+    write_ply(path, tiny.cut(model, 0.1))
+    away, *others = tiny.host_cameras(tiny.cameras())
+    cameras = tmp_path / "cameras.json"
+    cameras.write_text(json.dumps([away | {"position": [0, 0, 50]}, *others]))
+    report = run_json("profile", path, "--cameras", cameras)
+    assert report["warnings"] == []
+    cameras.write_text(json.dumps(others[-1:] + others))
+    assert report["psnr"] == pytest.approx(run_json("profile", path, "--cameras", cameras)["psnr"])
 
 
 def test_a_model_that_shows_other_things_is_told(data, path, model, tmp_path):
