@@ -91,7 +91,7 @@ class Settings:
             ("threshold_lr", rate, "a number, 0 or more"),
             ("opacity_lr", rate, "a number, 0 or more"),
             ("itself", lambda value: isinstance(value, bool), "True or False"),
-            ("stop", stop, "1e-4 to 1, a share of a pixel's light, 'auto' or None"),
+            ("stop", stop, "1e-4 to 1, a share of a pixel's light, 'auto' or none"),
             ("rim", (None, *get_args(Rim)).__contains__, "hard, soft or None"),
             ("dropout", lambda value: value is None or (rate(value) and value < 1), "0 to below 1"),
             ("seed", lambda value: type(value) is int, "a whole number"),

@@ -38,7 +38,7 @@ def test_every_view_has_a_file_of_its_own_in_the_folder(names):
 
 @pytest.mark.parametrize(
     ("fragments", "words"),
-    [([1.0, 2.0], []), ([0.0, 2.0], ["1 of 2"]), ([0.0], ["1 of 1"]), ([], [])],
+    [([1.0, 2.0], []), ([0.0, 2.0], ["1 of 2"]), ([0.0], ["The pictures show"]), ([], [])],
 )
 def test_views_that_show_nothing_are_warned_of(fragments, words):
     assert [

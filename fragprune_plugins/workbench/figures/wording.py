@@ -123,10 +123,8 @@ def sizes(pictures: Sequence[tuple[int, ...]]) -> str:
 def nothing_drawn(fragments: Sequence[float]) -> list[str]:
     """A warning where no Gaussian is seen; [] where each view or measurement has some."""
     empty = sum(each == 0 for each in fragments)
-    said = (
-        f"{empty} of {len(fragments)} show no Gaussian (0.0 fragments per pixel). Are these the "
-        "cameras of this model?"
-    )
+    which = f"{empty} of {len(fragments)} show" if len(fragments) > 1 else "The pictures show"
+    said = f"{which} no Gaussian (0.0 fragments per pixel). Are these the cameras of this model?"
     return [said] if empty else []
 
 
