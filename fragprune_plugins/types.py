@@ -48,7 +48,7 @@ def short(value: Any) -> str:
     Of a tensor that holds one number without an axis, that number.
     """
     if getattr(value, "ndim", None) == 0:
-        return f"{float(value):.6g}"
+        return f"{value.item():.6g}"
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         kind = str(value.dtype).removeprefix("torch.")
         device = str(getattr(value, "device", "cpu"))

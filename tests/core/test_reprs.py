@@ -37,7 +37,7 @@ def test_a_dataclass_with_tensors_is_shown_short(kind):
 def test_one_line_with_shapes_types_and_counts_and_without_the_numbers_of_tensors():
     splat, store = tiny.random_model(count=500), fp.ThresholdStore(500)
     inputs = fp.RasterInputs(tiny.cameras()[0].view(), splat.splats())
-    outputs = fp.rasterize(replace(inputs, counts=True))
+    outputs = fp.rasterize(replace(inputs, counts=True), tiny.cut(splat, 0.1).thresholds)
     for value in (inputs.view, inputs.splats, inputs, outputs):
         text = repr(value)
         assert text.startswith(type(value).__name__ + "(")
