@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from fragprune_plugins.workbench.figures.viewing import render_view as render_view
     from fragprune_plugins.workbench.finetune.api import finetune as finetune
     from fragprune_plugins.workbench.finetune.loop import FinetuneResult as FinetuneResult
+    from fragprune_plugins.workbench.finetune.relocation import spare as spare
     from fragprune_plugins.workbench.goals import AtMost as AtMost
     from fragprune_plugins.workbench.goals import Faster as Faster
     from fragprune_plugins.workbench.models.model import load as load
@@ -72,6 +73,7 @@ _NAMES = {
     "workbench.figures.viewing": "overview rasterize render_view",
     "workbench.finetune.api": "finetune",
     "workbench.finetune.loop": "FinetuneResult",
+    "workbench.finetune.relocation": "spare",
     "workbench.goals": "AtMost Faster",
     "workbench.models.model": "load save",
     "workbench.pruning": "keep_best keep_needed",

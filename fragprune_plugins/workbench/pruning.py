@@ -42,6 +42,7 @@ def kept(
     *,
     engine: str | Engine = "auto",
     progress: bool = False,
+    scores: Tensor | None = None,
 ) -> Tensor:
     """(N,) bool: the Gaussians that ``--keep`` leaves of N.
 
@@ -49,6 +50,7 @@ def kept(
         keep: a share of them in (0, 1]; "auto" for what ``keep_needed`` leaves, or "visible".
         shots: the photographs to learn from, on the model's device.
         views: whose pictures must not change.
+        scores: (N,) of these views, if they are known (``scored``).
 
     Raises:
         InputError: the share is not in (0, 1], there is no view, or no Gaussian is visible.
@@ -58,8 +60,8 @@ def kept(
         return visible(model, views, engine=drawer)
     if not views or (keep == "auto" and not shots):
         raise InputError("keep", "no view to judge by", "at least one", "Pass views of the model.")
-    bar = tqdm(views, "scoring Gaussians", unit="view", leave=None, disable=not progress)
-    scores = removal_error(model, bar, drawer)
+    if scores is None:
+        scores = scored(model, views, engine=drawer, progress=progress)
     if keep != "auto":
         return best(scores, keep)
     spared = SPARE * _error(model, shots, drawer) * len(views) / len(shots)
@@ -68,6 +70,12 @@ def kept(
     stays = best(scores, LEAST)
     stays[least[goes:]] = True
     return stays
+
+
+def scored(model: Model, views: Sequence[View], *, engine: Engine, progress: bool) -> Tensor:
+    """(N,) ``removal_error``, with a bar on stderr if there is ``progress``."""
+    bar = tqdm(views, "scoring Gaussians", unit="view", leave=None, disable=not progress)
+    return removal_error(model, bar, engine)
 
 
 @torch.no_grad()

@@ -54,27 +54,42 @@ def warming_up(patch):
 
 
 @pytest.mark.parametrize(
-    ("settings", "prepare"),
+    ("settings", "prepare", "rows"),
     [
-        (Settings(iterations=STEPS), None),
-        (Settings(iterations=STEPS, train="opacity", goal=Pressure(1e-3)), None),
-        (Settings(iterations=STEPS, dropout=0.2), None),
-        (Settings(iterations=STEPS, train="appearance", goal=Fewer(1.5)), None),
-        (Settings(iterations=STEPS, goal=Control(), seed=3), None),
-        (Settings(iterations=STEPS, goal=Portable()), None),
-        (Settings(iterations=STEPS), warming_up),
-        (Settings(iterations=STEPS, goal=Faster(1.2)), tiny.exact_clock),
+        (Settings(iterations=STEPS), None, None),
+        (Settings(iterations=STEPS, train="opacity", goal=Pressure(1e-3)), None, None),
+        (Settings(iterations=STEPS, dropout=0.2), None, None),
+        (Settings(iterations=STEPS), None, [41, 3, 5]),
+        (Settings(iterations=STEPS, train="appearance", goal=Fewer(1.5)), None, None),
+        (Settings(iterations=STEPS, goal=Control(), seed=3), None, None),
+        (Settings(iterations=STEPS, goal=Portable()), None, None),
+        (Settings(iterations=STEPS), warming_up, None),
+        (Settings(iterations=STEPS, goal=Faster(1.2)), tiny.exact_clock, None),
     ],
-    ids=["all", "opacity", "dropout", "target", "control", "portable", "warm-up", "target time"],
+    ids=[
+        "all",
+        "opacity",
+        "dropout",
+        "moving",
+        "target",
+        "control",
+        "portable",
+        "warm-up",
+        "target time",
+    ],
 )
-def test_cut_off_it_ends_as_never_cut(model, dataset, tmp_path, monkeypatch, settings, prepare):
+def test_cut_off_it_ends_as_never_cut(
+    model, dataset, tmp_path, monkeypatch, settings, prepare, rows
+):
     if prepare:
         prepare(monkeypatch)
+    moving = {"relocate": rows and torch.tensor(rows)}
     path, told = tmp_path / "out.fragprune-unfinished", []
-    whole = run(model, dataset, settings)
+    whole = run(model, dataset, settings, **moving)
+    given = {"tell": told.append, **moving}
     for cut in (2, 5, 8):  # before a checkpoint, and after one or two more
-        run(model, dataset, settings, path, cut=cut, monkeypatch=monkeypatch, tell=told.append)
-    result = run(model, dataset, settings, path, tell=told.append)
+        run(model, dataset, settings, path, cut=cut, monkeypatch=monkeypatch, **given)
+    result = run(model, dataset, settings, path, **given)
     assert [line.split(",")[0] for line in told] == [
         f"resuming at step {step} of {STEPS}" for step in (3, 9)
     ]

@@ -256,7 +256,7 @@ def quoted(path: object) -> str:
 
 
 def begun(data: Mapping[str, Any]) -> list[str]:
-    """Lines on what came before a fine-tuning's first step: its trial, and Gaussians removed."""
+    """Lines on a fine-tuning's trial, and on Gaussians removed before it or moved in it."""
     lines, dropout, keep = [], data["settings"].get("dropout"), data.get("keep")
     if data.get("forgotten") is not None and dropout:
         lines.append(
@@ -271,6 +271,8 @@ def begun(data: Mapping[str, Any]) -> list[str]:
         whole = measured["gaussians"] if measured else data["gaussians_before"]
         left = data["after"]["gaussians"] if measured else data["gaussians"]
         lines.append(f"Removed {whole - left:,} of {whole:,} Gaussians before learning, {why}.")
+    if moved := data.get("relocated"):
+        lines.append(f"Moved {moved:,} of the others to where some were missing.")
     return lines
 
 

@@ -81,7 +81,8 @@ RULES = (
     callback=_share,
     help="Before learning, remove Gaussians until this share is left, such as 0.8: first those "
     "whose removal least changes what training views, and others beside them, show. auto keeps "
-    "what the photographs need; visible, what reaches a pixel of any view. "
+    "what the photographs need, and moves those worth least to where some are missing, while it "
+    "learns; visible keeps what reaches a pixel of any view. "
     "--target-speedup counts from what is left.",
 )
 @click.option("--seed", type=int, default=0, show_default=True, help="Seed of the order of views.")
@@ -124,7 +125,8 @@ def command(**options: Any) -> Report | None:
 
     A MODEL that knows its photographs by heart shows them much better than what lies between them.
     100 steps on half of them tell: if the others get worse by 0.2 dB, --dropout 0.2 --keep 0.6 keep
-    cutoffs from suiting the photographs alone; if not, --keep auto removes what they can spare.
+    cutoffs from suiting the photographs alone; if not, --keep auto removes what they can spare,
+    and moves other Gaussians to where some are missing.
 
     \b
     Examples:

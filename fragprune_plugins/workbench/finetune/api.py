@@ -6,6 +6,8 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+from torch import Tensor
+
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import InputError, UsageError
 from fragprune_plugins.files.model import Model
@@ -15,6 +17,7 @@ from fragprune_plugins.plugins.hooks import engine_for, schedule_for
 from fragprune_plugins.workbench.distributed import ShardedEngine, Shards
 from fragprune_plugins.workbench.finetune.loop import FinetuneResult, Training
 from fragprune_plugins.workbench.finetune.processes import Processes
+from fragprune_plugins.workbench.finetune.relocation import relocates
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
 from fragprune_plugins.workbench.finetune.searching import strongest
 from fragprune_plugins.workbench.goals import AtMost
@@ -34,6 +37,7 @@ def finetune(
     progress: bool = False,
     checkpoints: Checkpoints | None = None,
     ranks: Ranks | None = None,
+    relocate: Tensor | None = None,
 ) -> FinetuneResult:
     """Learn the thresholds of a trained splat on its photographs; portable, its shapes.
 
@@ -58,6 +62,7 @@ def finetune(
             equal arguments and gets the same result; only the first writes checkpoints, draws the
             bar and tells observers. This one alone when None. With a ``ShardedEngine`` each passes
             its own Gaussians, and gets those back (``part_of``, ``whole_of``).
+        relocate: (M,) int64, the rows of Gaussians that move to where some are missing (``spare``).
 
     Raises:
         EngineError: no such engine here.
@@ -65,33 +70,29 @@ def finetune(
         CheckpointError: the checkpoint is broken, or another fine-tuning's.
         PluginError: a plugin raised, or gave an answer that cannot be used.
         UsageError: a target time that no thresholds reach; a portable goal for a model with
-            thresholds; a target time, or views that cannot be divided, in several processes.
+            thresholds; rows to relocate where none can move; a target time, or views that cannot
+            be divided, in several processes.
         RanksError: another process is gone, or differs.
         DivergedError: NaN or infinity in what trains.
     """
     ranks, model = ranks or Ranks(), models.of(model)
     settings, device = Settings() if settings is None else settings, model.device
     engine = engine_for(engine, device)
+    sharded = isinstance(engine, ShardedEngine)
     _expect_kinds(dataset, settings)
-    dataset = dataset.to(device)
     if isinstance(dataset.train[0], OwnPicture):
         settings = replace(settings, itself=True)
-    goal = settings.goal
-    if isinstance(goal, AtMost):
+    _expect_fit(model, settings, moves=relocate is not None, sharded=sharded)
+    dataset = dataset.to(device)
+    if isinstance(settings.goal, AtMost):
         train = partial(finetune, model, dataset, engine=engine, progress=progress, ranks=ranks)
         return strongest(train, settings, dataset.test, engine=engine).result
-    sharded = isinstance(engine, ShardedEngine)
     processes = Shards(ranks, len(model)) if sharded else Processes(ranks)
     processes.expect_able(settings)
-    if goal.on_area and model.pruned:
-        raise UsageError(
-            "finetune",
-            "a portable goal, and a model with thresholds or a stop",
-            "a model without any: it is for viewers that ignore them",
-            "Pass model.untruncated(), or --no-truncation on the command line.",
-        )
     schedule = schedule or schedule_for(settings)
-    training = Training(model, dataset, settings, schedule, engine, processes, checkpoints)
+    training = Training(
+        model, dataset, settings, schedule, engine, processes, checkpoints, relocate
+    )
     return _learned(training, progress and ranks.first)
 
 
@@ -103,6 +104,21 @@ def _expect_kinds(dataset: Dataset, settings: Settings) -> None:
             raise InputError(f"finetune {name}", repr(given)[:80], f"a {kind.__name__}", remedy)
     if not dataset.train:
         raise InputError("dataset", "no training view", "at least one", "Pass photographs.")
+
+
+def _expect_fit(model: Model, settings: Settings, *, moves: bool, sharded: bool) -> None:
+    """Raise UsageError unless the model can become what is asked for."""
+    if settings.goal.on_area and model.pruned:
+        raise UsageError(
+            "finetune",
+            "a portable goal, and a model with thresholds or a stop",
+            "a model without any: it is for viewers that ignore them",
+            "Pass model.untruncated(), or --no-truncation on the command line.",
+        )
+    if moves and (sharded or not relocates(model, settings)):
+        found = "relocate, where positions stay, own pictures teach, or Gaussians are left out"
+        expected = "all parameters of a model without 3D filter, learned from photographs"
+        raise UsageError("finetune", found, expected, "Leave relocate out.")
 
 
 def _learned(training: Training, progress: bool) -> FinetuneResult:
@@ -129,6 +145,7 @@ def _learned(training: Training, progress: bool) -> FinetuneResult:
         interrupted=interrupted,
         terminated=terminated,
         resumed_at=resumed,
+        relocated=training.relocated,
     )
     training.end()
     return result

@@ -167,6 +167,7 @@ class Finetuned:
             "seen": self.opened.seen,
             "pictures": self.opened.configuration["photographs"],
             "keep": asked.keep,
+            "relocated": result.relocated,
             "forgotten": self.forgotten,
             "speedup": done.speedup,
             "faster": done.faster,

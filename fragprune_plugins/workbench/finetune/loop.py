@@ -21,6 +21,7 @@ from fragprune_plugins.learning.adam import EPSILON, stepping_fused
 from fragprune_plugins.learning.area import area_per_pixel
 from fragprune_plugins.learning.deferred import DeferredSignals, between_steps
 from fragprune_plugins.learning.events import Progress, StepStats
+from fragprune_plugins.learning.pressure import ElasticPressure
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins import hookspecs
@@ -30,6 +31,7 @@ from fragprune_plugins.types import RasterInputs, RasterOutputs, one_line
 from fragprune_plugins.workbench.finetune.faster import FrameTarget, require_reach
 from fragprune_plugins.workbench.finetune.losses import code_for, photometric_loss
 from fragprune_plugins.workbench.finetune.processes import Processes, SharedStage
+from fragprune_plugins.workbench.finetune.relocation import DEEPER, POSITIONS, Relocation
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints, configuration
 from fragprune_plugins.workbench.goals import Faster
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
@@ -67,6 +69,7 @@ class FinetuneResult:
         interrupted: Ctrl-C or SIGTERM ended it early; the result is what was learned until then.
         terminated: SIGTERM ended it.
         resumed_at: steps that came out of a checkpoint; 0 without one.
+        relocated: Gaussians that moved to where some were missing.
     """
 
     model: Model
@@ -78,6 +81,7 @@ class FinetuneResult:
     interrupted: bool
     terminated: bool
     resumed_at: int = 0
+    relocated: int = 0
 
     __repr__ = one_line
 
@@ -89,6 +93,8 @@ class Training:
         start: the model as it comes in; not changed.
         dataset: on the model's device.
         checkpoints: from which it goes on, if there is one, and where the next ones go.
+        relocate: (M,) int64, the rows of Gaussians that move to where some are missing, the one
+            worth least first; see ``Relocation``.
 
     Attributes:
         model: as it is now; what trains has gradients.
@@ -107,6 +113,7 @@ class Training:
         engine: Engine,
         processes: Processes,
         checkpoints: Checkpoints | None = None,
+        relocate: Tensor | None = None,
     ) -> None:
         self.start, self.dataset, self.settings = start, dataset, settings
         self.engine, self.processes = engine, processes
@@ -130,15 +137,13 @@ class Training:
             target=target,
             everywhere=processes.everywhere,
         )
-        rates = {"opacity": settings.opacity_lr}
-        if settings.train in ("appearance", "all"):
-            rates |= _APPEARANCE
-        if settings.train == "all":
-            rates |= _GEOMETRY | {"xyz": _GEOMETRY["xyz"] * dataset.extent}
-        if settings.dropout and settings.train == "all" and not settings.itself:
-            rates |= {
-                name: _WITH_DROPOUT * rate for name, rate in rates.items() if name != "opacity"
-            }
+        rates, self.relocation = rates_of(settings, dataset.extent), None
+        if relocate is not None:
+            rates["xyz"] *= POSITIONS
+            self.relocation = Relocation(relocate, len(start), settings.iterations)
+            if isinstance(pressure := self.stage.pressure, ElasticPressure):
+                pressure.elasticity *= DEEPER
+                pressure.most *= DEEPER
         leaves: dict[str, Any] = {
             name: getattr(start, name)
             .detach()
@@ -160,7 +165,8 @@ class Training:
         processes, device = self.processes, self.start.device
         given = self.start, self.dataset, self.settings, self.engine.name
         asked = processes.described(configuration(*given, self.stage.schedule))
-        self._configuration = asked | {"loss": code_for(device)}
+        moves = None if self.relocation is None else self.relocation.gone(self.settings.iterations)
+        self._configuration = asked | {"loss": code_for(device), "moves": moves}
         if checkpoints is not None:
             where = "cpu" if processes.divided else device
             tensors, values = checkpoints.load(self._configuration, where)
@@ -198,6 +204,8 @@ class Training:
                 tensors[f"{moment}.{name}"] = moments[moment]
         for name in sorted(tensors.keys() - _OF_VIEWS):  # in the same order in all processes
             tensors[name] = self.processes.whole(tensors[name])
+        if self.relocation is not None:
+            tensors["pull"] = self.relocation.pull
         points = [astuple(point) for point in self.curves]
         tensors["curves"] = torch.tensor(points, dtype=torch.float64).reshape(len(points), -1)
         return tensors, values | {
@@ -210,6 +218,8 @@ class Training:
     def _load_state_dict(self, tensors: dict[str, Tensor], values: dict[str, Any]) -> None:
         """Take over what ``_state_dict`` gave; raises one of ``_UNFIT`` if it does not fit."""
         stage = self.stage
+        if self.relocation is not None:
+            self.relocation.pull.copy_(tensors.pop("pull"))
         for name in tensors.keys() - _OF_VIEWS - {"curves"}:
             tensors[name] = self.processes.own(tensors[name])
         stage.load_state_dict(tensors, values)
@@ -242,6 +252,11 @@ class Training:
     def end(self) -> None:
         """Free what steps alone need: moments, and stage 2, whose views hold this in a cycle."""
         del self.optimizer, self.stage
+
+    @property
+    def relocated(self) -> int:
+        """Gaussians that have moved."""
+        return 0 if self.relocation is None else self.relocation.gone(self.done)
 
     @property
     def seconds(self) -> float:
@@ -309,6 +324,8 @@ class Training:
             group["lr"] = stage.rate(group["name"], self.rates[group["name"]])
         stage.expect_sound()
         self.optimizer.step()
+        if self.relocation is not None:
+            self.relocation.stepped(self.done + 1, self.model, stage.store, self.optimizer)
         self.optimizer.zero_grad(set_to_none=True)
         stage.end()
         self.done += 1
@@ -337,6 +354,18 @@ class Training:
     def _plain(self, inputs: RasterInputs) -> RasterOutputs:
         """Draw without thresholds and stop."""
         return drawn_by(self.engine, replace(inputs, stop=None), None)
+
+
+def rates_of(settings: Settings, extent: float) -> dict[str, float]:
+    """Initial learning rates of the parameters that train, by name, in steps of one view."""
+    rates = {"opacity": settings.opacity_lr}
+    if settings.train in ("appearance", "all"):
+        rates |= _APPEARANCE
+    if settings.train == "all":
+        rates |= _GEOMETRY | {"xyz": _GEOMETRY["xyz"] * extent}
+    if settings.dropout and settings.train == "all" and not settings.itself:
+        rates |= {name: _WITH_DROPOUT * rate for name, rate in rates.items() if name != "opacity"}
+    return rates
 
 
 def order(

@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any
 
 import click
+from torch import Tensor
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.cpu.memory import keep_freed_memory
@@ -29,13 +30,14 @@ from fragprune_plugins.workbench.figures.matching import OTHER_SCENE, matched, s
 from fragprune_plugins.workbench.figures.metrics import expect_window
 from fragprune_plugins.workbench.finetune import api, resuming
 from fragprune_plugins.workbench.finetune.finished import Asked, Finetuned, Opened, finished
+from fragprune_plugins.workbench.finetune.relocation import least, relocates
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
 from fragprune_plugins.workbench.finetune.searching import strongest
 from fragprune_plugins.workbench.finetune.trial import tried
 from fragprune_plugins.workbench.goals import AtMost
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.models.model import require_place
-from fragprune_plugins.workbench.pruning import kept
+from fragprune_plugins.workbench.pruning import kept, scored
 from fragprune_plugins.workbench.ranks import Ranks, joined, launched
 from fragprune_plugins.workbench.scenes.dataset import Dataset, load_photographs
 from fragprune_plugins.workbench.scenes.generated import views_near
@@ -159,13 +161,13 @@ def _learned(opened: Opened, ranks: Ranks, lost: float | None) -> tuple[Finetune
     if asked.shard:
         whole, engine = part_of(whole, ranks, opened.device), ShardedEngine(engine, ranks)
     start = Candidate(whole, gaussians=count)
-    left = _keep(whole, asked, dataset.to(opened.device), engine)
+    left, rows = _keep(whole, asked, dataset.to(opened.device), engine)
     train = partial(api.finetune, left, dataset, engine=engine, progress=True, ranks=ranks)
     if isinstance(settings.goal, AtMost):
         found = strongest(train, settings, dataset.test, engine=engine, say=_say)
         result = found.result
     else:
-        result = train(settings, checkpoints=opened.checkpoints)
+        result = train(settings, checkpoints=opened.checkpoints, relocate=rows)
     saved = whole_of(result.model, ranks) if asked.shard else result.model
     if ranks.first:
         records.path_beside(asked.out).unlink(missing_ok=True)  # of the file that was there
@@ -174,10 +176,15 @@ def _learned(opened: Opened, ranks: Ranks, lost: float | None) -> tuple[Finetune
     return Finetuned(opened, start, result, lost, found, truncated, shards), engine
 
 
-def _keep(whole: Model, asked: Asked, dataset: Dataset, engine: Engine) -> Model:
-    """The Gaussians that --keep leaves, for what training views and cameras beside them show."""
+def _keep(
+    whole: Model, asked: Asked, dataset: Dataset, engine: Engine
+) -> tuple[Model, Tensor | None]:
+    """The Gaussians that --keep leaves, for what training views and cameras beside them show.
+
+    Of those that auto leaves also the rows of some that may move to where others are missing.
+    """
     if asked.keep in (None, 1):
-        return whole
+        return whole, None
     shots = dataset.train
     if asked.keep == "visible":
         views = [shot.view for shot in (*shots, *dataset.test)]
@@ -185,4 +192,8 @@ def _keep(whole: Model, asked: Asked, dataset: Dataset, engine: Engine) -> Model
         views = [shot.view for shot in shots]
     else:
         views = views_near(shots, seed=asked.seed)
-    return whole.keep(kept(whole, asked.keep, shots, views, engine=engine, progress=True))
+    scores = scored(whole, views, engine=engine, progress=True) if asked.keep == "auto" else None
+    stays = kept(whole, asked.keep, shots, views, engine=engine, progress=True, scores=scores)
+    if scores is None or not relocates(whole, asked.settings):
+        return whole.keep(stays), None
+    return whole.keep(stays), least(scores[stays])

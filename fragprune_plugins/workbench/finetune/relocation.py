@@ -1,0 +1,153 @@
+"""Moves Gaussians, while a model learns, from where they are worth least to where some are missing.
+
+A training ends with Gaussians that its photographs hardly need, and with others that stand for more
+than one can show: photographs pull hard at their positions. Each of the latter is split in two, and
+one of the former becomes its second half. (3DGS-MCMC, NeurIPS 2024, moves Gaussians in a training;
+Improved-GS, 2025, splits them along the longest axis.)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+
+import torch
+from torch import Tensor
+
+from fragprune_plugins.engines import Engine
+from fragprune_plugins.errors import InputError
+from fragprune_plugins.files.model import Model
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.plugins.hooks import engine_for
+from fragprune_plugins.types import View
+from fragprune_plugins.workbench.goals import AtMost
+from fragprune_plugins.workbench.pruning import removal_error
+
+SHARE = 0.15
+"""Of the Gaussians, that move; docs/results.md has the runs that chose this and what follows."""
+
+POSITIONS = 10.0
+"""Times the usual rate of positions: the hosts' first, for what moved has a place to find."""
+
+DEEPER = 1.4
+"""Times the usual default pressure, and its upper end: the better picture affords deeper cuts."""
+
+_ROUNDS, _FIRST, _LAST = 10, 0.05, 0.3  # of the run: what moves later has not settled at its end
+_APART = 0.7  # twins' distance from the whole, over its longest axis: they are as long together
+_OPACITY = 0.7  # of a twin, over that of the whole
+_MOMENTS = ("exp_avg", "exp_avg_sq")
+
+
+def relocates(model: Model, settings: Settings) -> bool:
+    """Whether Gaussians may move: where photographs teach all of a model, and none is left out."""
+    able = settings.train == "all" and model.filter_3d is None
+    return able and not (settings.dropout or settings.itself or isinstance(settings.goal, AtMost))
+
+
+def spare(model: Model, views: Iterable[View], *, engine: str | Engine = "auto") -> Tensor:
+    """(M,) int64: the Gaussians that may move, for ``finetune(relocate=)``.
+
+    They are 15 % of the model's, those of the least ``removal_error``, the least first.
+
+    Args:
+        views: to score them on, on the model's device, such as those that ``views_near`` gives.
+        engine: a name or an engine.
+    """
+    return least(removal_error(model, views, engine_for(engine, model.device)))
+
+
+def least(scores: Tensor) -> Tensor:
+    """(M,) int64: the rows of a share of the scores (N,), the least first."""
+    return scores.argsort(stable=True)[: int(SHARE * len(scores))]
+
+
+class Relocation:
+    """Gaussians on the move in a run.
+
+    Args:
+        rows: (M,) int64, of N Gaussians those that move, the one worth least first.
+        count: N, at least 2 M.
+        steps: of the run.
+
+    Raises:
+        InputError: these are not such rows.
+
+    Attributes:
+        pull: (2, N) float32, since the last move: how much the loss would change if a Gaussian
+            moved by its own size, summed over the views that see it, and the number of these.
+    """
+
+    def __init__(self, rows: Tensor, count: int, steps: int) -> None:
+        known = rows.dtype == torch.int64 and rows.ndim == 1 and 2 * len(rows) <= count
+        if not known or len(set(rows.tolist()) & set(range(count))) != len(rows):
+            found = (
+                f"{rows.dtype} of shape {tuple(rows.shape)}, or a row twice, or one of no Gaussian"
+            )
+            expected = f"torch.int64, at most half of {count} rows, each once"
+            raise InputError("relocate", found, expected, "Pass what spare(model, views) gives.")
+        self._rows, self._steps = rows, steps
+        self.pull = torch.zeros(2, count, device=rows.device)
+
+    def gone(self, step: int) -> int:
+        """How many have moved when a step is over."""
+        over = (step / self._steps - _FIRST) / (_LAST - _FIRST)
+        return len(self._rows) * int(_ROUNDS * min(1.0, max(0.0, over))) // _ROUNDS
+
+    @torch.no_grad()
+    def stepped(
+        self, step: int, model: Model, store: ThresholdStore, optimizer: torch.optim.Optimizer
+    ) -> None:
+        """Take note of gradients, which a step has left; move what is to move after this step.
+
+        Args:
+            step: counted from 1.
+            model: whose parameters the optimizer moves, all of them; changed in place.
+        """
+        if self.gone(step) == len(self._rows) == self.gone(step - 1):
+            return
+        assert model.xyz.grad is not None
+        pull = model.xyz.grad.norm(dim=1) * model.scaling.exp().amax(dim=1)
+        self.pull += torch.stack([pull, (pull > 0).float()])
+        leaving = self._rows[self.gone(step - 1) : self.gone(step)]
+        if not len(leaving):
+            return
+        mean = self.pull[0] / self.pull[1].clamp(min=1)
+        mean[self._rows[self.gone(step - 1) :]] = -1  # what is to go itself
+        wholes = mean.topk(len(leaving)).indices
+        parameters = {group["name"]: group["params"][0] for group in optimizer.param_groups}
+        split(parameters, wholes, leaving)
+        twins = torch.cat([wholes, leaving])
+        for parameter in parameters.values():
+            for moment in _MOMENTS:
+                optimizer.state[parameter][moment][twins] = 0
+        origins = torch.arange(len(store), device=twins.device)
+        fresh = torch.isin(origins, twins)
+        origins[leaving] = wholes
+        store.rearrange(origins, fresh)
+        self.pull.zero_()
+
+
+def split(parameters: Mapping[str, Tensor], wholes: Tensor, others: Tensor) -> None:
+    """Make two of each of some Gaussians, side by side along its longest axis.
+
+    Args:
+        parameters: of a ``Model``, by name, each (N, ...); changed in place.
+        wholes: (K,) int64, the rows that are split.
+        others: (K,) int64, the rows of what is lost for the second halves.
+    """
+    for each in parameters.values():
+        each[others] = each[wholes]
+    sizes = parameters["scaling"][wholes].exp()
+    size, axis = sizes.max(dim=1)
+    longest = torch.nn.functional.one_hot(axis, sizes.shape[1]).to(size)
+    along = torch.nn.functional.pad(longest, (0, 3 - sizes.shape[1]))  # a surfel has two axes
+    q = torch.nn.functional.normalize(parameters["rotation"][wholes])
+    w, v = q[:, :1], q[:, 1:]
+    twice = 2 * torch.linalg.cross(v, along)
+    offset = _APART * size[:, None] * (along + w * twice + torch.linalg.cross(v, twice))
+    for rows, side in ((wholes, 1), (others, -1)):
+        parameters["xyz"][rows] += side * offset
+        parameters["scaling"][rows] += longest * (0.5 * math.log(1 - _APART**2))
+        opacity = parameters["opacity"][rows].sigmoid() * _OPACITY
+        parameters["opacity"][rows] = opacity.logit(1e-6)

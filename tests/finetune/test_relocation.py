@@ -1,0 +1,144 @@
+"""Gaussians that are worth little move to where some are missing, while a model learns."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from finetune import tiny
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fragprune_plugins.engines import create_engine
+from fragprune_plugins.errors import InputError, UsageError
+from fragprune_plugins.learning.goals import Control
+from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.workbench.figures.evaluate import Candidate, psnrs
+from fragprune_plugins.workbench.finetune.api import finetune
+from fragprune_plugins.workbench.finetune.relocation import SHARE, Relocation, least, split
+
+PARAMETERS = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
+
+
+def parameters(model):
+    return {name: getattr(model, name).clone() for name in PARAMETERS}
+
+
+def covariances(scaling, rotation):
+    """(N, 3, 3) float64, from the matrices of complex 2x2 spin: a formulation of its own."""
+    q = torch.nn.functional.normalize(rotation.double())
+    w, x, y, z = (each.to(torch.complex128) for each in q.unbind(1))
+    spin = torch.stack([w - 1j * z, -y - 1j * x, y - 1j * x, w + 1j * z], 1).reshape(-1, 2, 2)
+    pauli = torch.tensor(
+        [[[0, 1], [1, 0]], [[0, -1j], [1j, 0]], [[1, 0], [0, -1]]], dtype=torch.complex128
+    )
+    turned = torch.einsum("nab,ibc,ndc->niad", spin, pauli, spin.conj())  # U sigma_i U*
+    axes = 0.5 * torch.einsum("niab,jba->nji", turned, pauli).real
+    sizes = torch.zeros(len(q), 3, dtype=torch.float64)
+    sizes[:, : scaling.shape[1]] = scaling.double().exp()
+    return torch.einsum("nji,ni,nki->njk", axes, sizes**2, axes)
+
+
+@given(seed=st.integers(0, 10**6), axes=st.sampled_from([2, 3]))
+def test_two_halves_lie_where_the_whole_lay_and_are_as_large_together(seed, axes):
+    model = tiny.random_model(8, seed=seed)
+    before = parameters(model)
+    before["scaling"] = before["scaling"][:, :axes]
+    after = {name: each.clone() for name, each in before.items()}
+    wholes, others = torch.tensor([5, 1]), torch.tensor([0, 7])
+    split(after, wholes, others)
+    same = torch.tensor([2, 3, 4, 6])
+    for name, each in after.items():
+        assert torch.equal(each[same], before[name][same]), name
+    for name in ("f_dc", "f_rest", "rotation"):
+        for rows in (wholes, others):
+            assert torch.equal(after[name][rows], before[name][wholes]), name
+    middle = (after["xyz"][wholes] + after["xyz"][others]) / 2
+    torch.testing.assert_close(middle, before["xyz"][wholes])
+    off = (after["xyz"][wholes] - middle).double()
+    assert (off.norm(dim=1) > 0).all()
+    spread = covariances(after["scaling"], after["rotation"])[wholes]
+    spread = spread + torch.einsum("ni,nj->nij", off, off)
+    whole = covariances(before["scaling"], before["rotation"])[wholes]
+    torch.testing.assert_close(spread, whole, rtol=1e-4, atol=1e-7)  # float32 positions
+    opacity = after["opacity"].sigmoid()[torch.cat([wholes, others])]
+    torch.testing.assert_close(opacity, 0.7 * before["opacity"].sigmoid()[wholes].repeat(2, 1))
+
+
+@pytest.fixture(scope="module")
+def lacking(tmp_path_factory):
+    """Photographs of four Gaussians, for which our first two stand; the last four are far above."""
+    places = torch.tensor([[-0.45, 0, 0], [-0.15, 0, 0], [0.15, 0, 0], [0.45, 0, 0]])
+    truth = tiny.round_ones(places, 0.08)
+    truth.f_dc[::2] = 1.5
+    unseen = torch.tensor([[0.0, -40, 0], [1.0, -40, 0], [2.0, -40, 0], [3.0, -40, 0]])
+    mine = tiny.round_ones(torch.cat([places[::2] + 0.15, unseen]), 0.08)
+    mine.scaling[:2, 0] = torch.tensor(0.2).log()
+    return mine, tiny.dataset_in_memory(tmp_path_factory.mktemp("images"), truth)
+
+
+def test_what_the_photographs_pull_at_gets_a_twin(lacking):
+    mine, dataset = lacking
+    engine, settings = create_engine("auto"), Settings(iterations=200, goal=Control())
+
+    def quality(rows):
+        result = finetune(mine, dataset, settings, engine=engine, relocate=rows)
+        assert len(result.model) == len(mine)
+        assert result.relocated == (0 if rows is None else len(rows))
+        values = psnrs(Candidate(result.model), dataset.train, engine)[0]
+        return sum(values) / len(values), result.model
+
+    alone, _ = quality(None)
+    better, model = quality(torch.tensor([4, 3]))
+    assert better > alone + 1  # dB; it is 1.6
+    assert (model.xyz[[3, 4]].abs() < 1).all()  # they are in the picture now
+    assert torch.equal(model.xyz[[2, 5]], mine.xyz[[2, 5]])  # nobody asked for these
+
+
+def test_rows_move_in_their_order_and_never_become_twins_of_what_moves_too(lacking):
+    mine, dataset = lacking
+    moving = Relocation(torch.tensor([5, 3]), len(mine), 20)
+    assert [moving.gone(step) for step in (0, 1, 3, 4, 6, 20)] == [0, 0, 0, 1, 2, 2]
+    result = finetune(mine, dataset, Settings(iterations=20), relocate=torch.tensor([5, 3]))
+    assert result.relocated == 2
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        torch.tensor([0, 1, 2, 3]),
+        torch.tensor([4, 4]),
+        torch.tensor([6]),
+        torch.tensor([-1]),
+        torch.tensor([4.0]),
+        torch.tensor([True, False, False, False, False, False]),
+        torch.tensor([[4]]),
+    ],
+    ids=["more than half", "twice", "beyond", "negative", "float", "mask", "table"],
+)
+def test_rows_that_are_none_are_refused(lacking, rows):
+    mine, dataset = lacking
+    with pytest.raises(InputError, match="relocate"):
+        finetune(mine, dataset, Settings(iterations=3), relocate=rows)
+
+
+@pytest.mark.parametrize("settings", [{"train": "opacity"}, {"dropout": 0.1}, {"itself": True}])
+def test_where_nothing_can_move_it_is_refused(lacking, settings):
+    mine, dataset = lacking
+    with pytest.raises(UsageError, match="relocate"):
+        finetune(mine, dataset, Settings(iterations=3, **settings), relocate=torch.tensor([4]))
+
+
+@pytest.mark.parametrize("count", [0, 1, 6, 100])
+def test_the_least_of_the_scores_can_be_spared(count):
+    scores = torch.randperm(count).float()
+    rows = least(scores)
+    assert len(rows) == int(SHARE * count)
+    assert scores[rows].tolist() == list(range(len(rows)))
+
+
+def test_moments_and_cutoffs_of_twins_begin_anew(lacking):
+    mine, dataset = lacking
+    cut = replace(tiny.cut(mine, 0.3))
+    result = finetune(cut, dataset, Settings(iterations=3), relocate=torch.tensor([3]))
+    assert result.model.falloff is not None
+    assert torch.isfinite(result.model.falloff).all()
