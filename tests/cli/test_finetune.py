@@ -124,6 +124,24 @@ def test_gaussians_are_removed_before_learning(path, model, words, out, keep, le
     assert (report["before"]["gaussians"], report["after"]["gaussians"]) == (60, len(rows))
 
 
+@pytest.mark.parametrize(
+    ("keep", "options", "share"),
+    [
+        ("auto", (), 0.15),
+        ("auto", ("--control",), 0.15),
+        ("auto", ("--train", "opacity"), 0),
+        ("auto", ("--dropout", 0.1), 0),
+        (0.7, (), 0),
+    ],
+)
+def test_gaussians_move_where_auto_says_which_can_be_spared(words, keep, options, share):
+    report = run_json(*words, 10, "--keep", keep, *options)
+    moved = int(share * report["after"]["gaussians"])
+    assert report["relocated"] == moved
+    told = run(*words, 10, "--keep", keep, *options, "--again").stdout
+    assert (f"Moved {moved} of the others to where some were missing." in told) == (moved > 0)
+
+
 def test_what_shows_beside_the_photographs_stays(data, model, words, out):
     shots = fp.load_dataset(data).train
     views = fp.views_near(shots)

@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import InputError, UsageError
-from fragprune_plugins.learning.goals import Control
+from fragprune_plugins.learning.goals import Control, Pressure
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.workbench.figures.evaluate import Candidate, psnrs
 from fragprune_plugins.workbench.finetune.api import finetune
-from fragprune_plugins.workbench.finetune.relocation import SHARE, Relocation, least, split
+from fragprune_plugins.workbench.finetune.relocation import DEEPER, SHARE, Relocation, least, split
 
 PARAMETERS = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
 
@@ -128,6 +128,13 @@ def test_where_nothing_can_move_it_is_refused(lacking, settings):
         finetune(mine, dataset, Settings(iterations=3, **settings), relocate=torch.tensor([4]))
 
 
+def test_a_model_with_a_3d_filter_is_refused(lacking):
+    mine, dataset = lacking
+    filtered = replace(mine, filter_3d=torch.full((len(mine), 1), 0.01))
+    with pytest.raises(UsageError, match="3D filter"):
+        finetune(filtered, dataset, Settings(iterations=3), relocate=torch.tensor([4]))
+
+
 @pytest.mark.parametrize("count", [0, 1, 6, 100])
 def test_the_least_of_the_scores_can_be_spared(count):
     scores = torch.randperm(count).float()
@@ -136,9 +143,21 @@ def test_the_least_of_the_scores_can_be_spared(count):
     assert scores[rows].tolist() == list(range(len(rows)))
 
 
-def test_moments_and_cutoffs_of_twins_begin_anew(lacking):
+def test_a_twin_has_the_cutoff_of_the_whole_and_both_have_no_moments(lacking):
     mine, dataset = lacking
-    cut = replace(tiny.cut(mine, 0.3))
-    result = finetune(cut, dataset, Settings(iterations=3), relocate=torch.tensor([3]))
-    assert result.model.falloff is not None
-    assert torch.isfinite(result.model.falloff).all()
+    cut = tiny.cut(mine, torch.tensor([0.3, 0.4, 0.5, 0.6, 0.7, 0.8]))
+    fixed = Settings(iterations=10, goal=Pressure(1e-4), threshold_lr=0.0)
+    result = finetune(cut, dataset, fixed, relocate=torch.tensor([3]))
+    found = result.model.falloff
+    assert found[3] in found[:2]
+    others = [0, 1, 2, 4, 5]
+    torch.testing.assert_close(found[others], cut.falloff[others])
+
+
+@pytest.mark.parametrize("goal", [Pressure(), Pressure(1e-4), Control()])
+def test_the_default_pressure_alone_is_higher(lacking, goal):
+    mine, dataset = lacking
+    settings = Settings(iterations=10, goal=goal)
+    usual = finetune(mine, dataset, settings).progress.pressure
+    higher = finetune(mine, dataset, settings, relocate=torch.tensor([3])).progress.pressure
+    assert higher == pytest.approx(usual * (DEEPER if goal == Pressure() else 1))

@@ -30,7 +30,7 @@ SHARE = 0.15
 POSITIONS = 10.0
 """Times the usual rate of positions: the hosts' first, for what moved has a place to find."""
 
-DEEPER = 1.4
+DEEPER = 1.6
 """Times the usual default pressure, and its upper end: the better picture affords deeper cuts."""
 
 _ROUNDS, _FIRST, _LAST = 10, 0.05, 0.3  # of the run: what moves later has not settled at its end
