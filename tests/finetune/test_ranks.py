@@ -24,9 +24,10 @@ from fragprune_plugins.workbench.ranks import Ranks, fingerprint, joined, launch
 ALL = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
 
 
-def learned(model, dataset, settings, ranks=None):
+def learned(model, dataset, settings, ranks=None, moving=()):
     """Everything that a fine-tuning leaves, as plain values."""
-    result = finetune(model, dataset, settings, engine="cpu", ranks=ranks)
+    rows = torch.tensor(moving) if moving else None
+    result = finetune(model, dataset, settings, engine="cpu", ranks=ranks, relocate=rows)
     return tiny.state(result.model), str(result.curves), result.progress
 
 
@@ -36,11 +37,13 @@ def require_same(one, other):
     assert one[1:] == other[1:]
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_two_processes_learn_what_one_does_with_as_many_views_to_the_bit(model, dataset, case):
+@pytest.mark.parametrize(("case", "moving"), [*((c, ()) for c in CASES), ("all", (41, 3, 5))])
+def test_two_processes_learn_what_one_does_with_as_many_views_to_the_bit(
+    model, dataset, case, moving
+):
     settings = CASES[case]
-    whole = learned(model, dataset, settings)
-    first, second = learn(2, lambda ranks: learned(model, dataset, settings, ranks))
+    whole = learned(model, dataset, settings, moving=moving)
+    first, second = learn(2, lambda ranks: learned(model, dataset, settings, ranks, moving))
     require_same(first, second)
     if settings.views_per_step == 2:  # a + b is b + a
         require_same(whole, first)
