@@ -14,14 +14,7 @@ from fragprune_plugins.learning.goals import Control, Pressure
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.workbench.figures.evaluate import Candidate, psnrs
 from fragprune_plugins.workbench.finetune.api import finetune
-from fragprune_plugins.workbench.finetune.relocation import (
-    DEEPER,
-    SHARE,
-    STOP,
-    Relocation,
-    least,
-    split,
-)
+from fragprune_plugins.workbench.finetune.relocation import DEEPER, SHARE, Relocation, least, split
 
 PARAMETERS = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
 
@@ -168,21 +161,3 @@ def test_the_default_pressure_alone_is_higher(lacking, goal):
     usual = finetune(mine, dataset, settings).progress.pressure
     higher = finetune(mine, dataset, settings, relocate=torch.tensor([3])).progress.pressure
     assert higher == pytest.approx(usual * (DEEPER if goal == Pressure() else 1))
-
-
-@pytest.mark.parametrize(
-    ("settings", "own", "expected"),
-    [
-        ({}, None, STOP),
-        ({}, 0.05, 0.05),
-        ({"stop": 0.01}, None, 0.01),
-        ({"stop": None}, None, None),
-        ({"goal": Control()}, None, None),
-    ],
-)
-def test_a_stop_that_nobody_chose_is_later(lacking, settings, own, expected):
-    mine, dataset = lacking
-    mine = mine if own is None else mine.with_rules(stop=own)
-    asked = Settings(iterations=3, **settings)
-    result = finetune(mine, dataset, asked, relocate=torch.tensor([4]))
-    assert result.model.stop == expected

@@ -85,8 +85,7 @@ _OPTIONS = (
         show_default=True,
         help="A pixel draws the fragment that leaves less than this share of its light, and ends "
         f"there. auto: the model's own; else {USUAL_STOP:g} where cutoffs learn from "
-        "photographs, 0.02 where Gaussians move, as with --keep auto. off: add none. A number also "
-        "works with --control.",
+        "photographs. off: add none. A number also works with --control.",
     ),
     click.option(
         "--rim",

@@ -17,7 +17,7 @@ from fragprune_plugins.plugins.hooks import engine_for, schedule_for
 from fragprune_plugins.workbench.distributed import ShardedEngine, Shards
 from fragprune_plugins.workbench.finetune.loop import FinetuneResult, Training
 from fragprune_plugins.workbench.finetune.processes import Processes
-from fragprune_plugins.workbench.finetune.relocation import relocates, with_stop
+from fragprune_plugins.workbench.finetune.relocation import relocates
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
 from fragprune_plugins.workbench.finetune.searching import strongest
 from fragprune_plugins.workbench.goals import AtMost
@@ -87,7 +87,6 @@ def finetune(
     if isinstance(settings.goal, AtMost):
         train = partial(finetune, model, dataset, engine=engine, progress=progress, ranks=ranks)
         return strongest(train, settings, dataset.test, engine=engine).result
-    settings = settings if relocate is None else with_stop(settings, model)
     processes = Shards(ranks, len(model)) if sharded else Processes(ranks)
     processes.expect_able(settings)
     schedule = schedule or schedule_for(settings)

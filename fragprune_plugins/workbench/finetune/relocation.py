@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -34,9 +33,6 @@ POSITIONS = 10.0
 DEEPER = 1.6
 """Times the usual default pressure, and its upper end: the better picture affords deeper cuts."""
 
-STOP = 0.02
-"""The stop that a model gets which has none: it costs nothing here, and saves 5 % beside 0.01."""
-
 _ROUNDS, _FIRST, _LAST = 10, 0.05, 0.3  # of the run: what moves later has not settled at its end
 _APART = 0.7  # twins' distance from the whole, over its longest axis: they are as long together
 _OPACITY = 0.7  # of a twin, over that of the whole
@@ -47,12 +43,6 @@ def relocates(model: Model, settings: Settings) -> bool:
     """Whether Gaussians may move: where photographs teach all of a model, and none is left out."""
     able = settings.train == "all" and model.filter_3d is None
     return able and not (settings.dropout or settings.itself or isinstance(settings.goal, AtMost))
-
-
-def with_stop(settings: Settings, model: Model) -> Settings:
-    """The settings with the stop that suits a model whose Gaussians move, if nobody chose one."""
-    free = settings.stop == "auto" and model.stop is None and settings.goal.learns
-    return replace(settings, stop=STOP) if free else settings
 
 
 def spare(model: Model, views: Iterable[View], *, engine: str | Engine = "auto") -> Tensor:
