@@ -19,7 +19,7 @@ def killed(step, *arguments):
     """Run the command in a process of its own, and kill it with -9 in the midst of a step."""
 
     def die():
-        resuming.EVERY = 0.001
+        resuming.EVERY = 0.0
         at_step(step, lambda: signal.raise_signal(signal.SIGKILL))
         run(*arguments)
 
