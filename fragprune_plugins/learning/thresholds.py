@@ -19,7 +19,7 @@ from fragprune_plugins.types import Rim, is_rim, is_stop, short
 
 _START_MARGIN = 1e-4  # thresholds start this far (relative) below the 1/255 skip: nothing changes
 _START_MAX = 0.99
-_MOMENTS = {"exp_avg": "their moments", "exp_avg_sq": "their second moments"}  # Adam's
+MOMENTS = {"exp_avg": "their moments", "exp_avg_sq": "their second moments"}  # Adam's
 _ROUNDING = 1e-4  # relative: sigmoid of logit loses less, unless the logit had to be clamped
 
 Known = TypeVar("Known")
@@ -267,7 +267,7 @@ class ThresholdStore:
         """
         origins = self._rows(origins, len(fresh), "rearrange")
         self._resize(lambda rows: rows[origins])
-        for name in _MOMENTS.keys() & self.adam:
+        for name in MOMENTS.keys() & self.adam:
             self.adam[name][fresh] = 0
 
     def replace(self, count: int) -> None:
@@ -277,7 +277,7 @@ class ThresholdStore:
     @property
     def numbers(self) -> dict[str, Tensor]:
         """All learned tensors, each (N,), by a name for messages."""
-        named = {said: self.adam[name] for name, said in _MOMENTS.items() if name in self.adam}
+        named = {said: self.adam[name] for name, said in MOMENTS.items() if name in self.adam}
         return {"thresholds": self.logits.detach(), **named}
 
     def state_dict(self) -> dict[str, Any]:
@@ -285,7 +285,7 @@ class ThresholdStore:
         zeros = torch.zeros_like(self.logits)
         return {
             "logits": self.logits.detach().clone(),
-            **{name: self.adam.get(name, zeros).detach().clone() for name in _MOMENTS},
+            **{name: self.adam.get(name, zeros).detach().clone() for name in MOMENTS},
             "adam_step": float(self.adam.get("step", 0.0)),
             "steps": self.steps,
             **({} if self.stop is None else {"stop": self.stop}),
@@ -299,7 +299,7 @@ class ThresholdStore:
             SidecarError: the state's parts do not fit together, or are no numbers that learning
                 can have left.
         """
-        rows = {name: state[name] for name in ("logits", *_MOMENTS)}
+        rows = {name: state[name] for name in ("logits", *MOMENTS)}
         stop, rim = state.get("stop"), state.get("rim", "hard")  # absent before there were any
         kinds = [(tuple(t.shape), t.dtype) for t in rows.values()]
         if set(kinds) != {((rows["logits"].numel(),), torch.float32)}:
@@ -321,12 +321,12 @@ class ThresholdStore:
         self.steps = int(state["steps"])
         if state["adam_step"] > 0:
             step = torch.tensor(float(state["adam_step"]), dtype=torch.float32)
-            self.adam = {"step": step} | {n: rows[n].to(device).clone() for n in _MOMENTS}
+            self.adam = {"step": step} | {n: rows[n].to(device).clone() for n in MOMENTS}
 
     def _resize(self, change: Callable[[Tensor], Tensor]) -> None:
         """Apply a row operation to logits and moments alike."""
         given = self._known(self._given)
-        moments = {name: change(self.adam[name]) for name in _MOMENTS.keys() & self.adam}
+        moments = {name: change(self.adam[name]) for name in MOMENTS.keys() & self.adam}
         self._bind(change(self.logits.detach()), self.adam | moments)
         if given is not None:
             self._given = self._note(change(given))

@@ -23,7 +23,7 @@ from fragprune_plugins.learning.deferred import DeferredSignals, between_steps
 from fragprune_plugins.learning.events import Progress, StepStats
 from fragprune_plugins.learning.pressure import ElasticPressure
 from fragprune_plugins.learning.schedule import Schedule, Settings
-from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.learning.thresholds import MOMENTS, ThresholdStore
 from fragprune_plugins.plugins import hookspecs
 from fragprune_plugins.plugins.hooks import drawn_by, thresholds_for
 from fragprune_plugins.plugins.loading import installed
@@ -46,7 +46,6 @@ _WITH_DROPOUT = 4.0
 pictures teach worse so: 29.75 dB in place of 29.89 on fox (--self --dropout 0.2)."""
 _POSTFIXES = 100  # times in a run that the bar says how it goes
 
-_MOMENTS = ("exp_avg", "exp_avg_sq")
 _OF_VIEWS = {"before", "after"}  # of stage 2's tensors; all others have a row for each Gaussian
 _UNFIT = (  # raised where the parts of a checkpoint do not fit what they are loaded into
     *(KeyError, ValueError, TypeError, IndexError, RuntimeError, AttributeError, OverflowError),
@@ -165,7 +164,7 @@ class Training:
         processes, device = self.processes, self.start.device
         given = self.start, self.dataset, self.settings, self.engine.name
         asked = processes.described(configuration(*given, self.stage.schedule))
-        moves = None if self.relocation is None else self.relocation.gone(self.settings.iterations)
+        moves = None if self.relocation is None else self.relocation.moved(self.settings.iterations)
         self._configuration = asked | {"loss": code_for(device), "moves": moves}
         if checkpoints is not None:
             where = "cpu" if processes.divided else device
@@ -200,7 +199,7 @@ class Training:
         for name, parameter in self.parameters().items():
             tensors[f"model.{name}"] = parameter
             moments = self.optimizer.state[parameter]
-            for moment in _MOMENTS:
+            for moment in MOMENTS:
                 tensors[f"{moment}.{name}"] = moments[moment]
         for name in sorted(tensors.keys() - _OF_VIEWS):  # in the same order in all processes
             tensors[name] = self.processes.whole(tensors[name])
@@ -230,7 +229,7 @@ class Training:
             step = torch.tensor(float(values["adam_step"]), dtype=torch.float32)
             moments = {
                 moment: torch.empty_like(parameter).copy_(tensors[f"{moment}.{name}"])
-                for moment in _MOMENTS
+                for moment in MOMENTS
             }
             self.optimizer.state[parameter] = {"step": step, **moments}
         self.curves += [StepStats(int(step), *row) for step, *row in tensors["curves"].tolist()]
@@ -256,7 +255,7 @@ class Training:
     @property
     def relocated(self) -> int:
         """Gaussians that have moved."""
-        return 0 if self.relocation is None else self.relocation.gone(self.done)
+        return 0 if self.relocation is None else self.relocation.moved(self.done)
 
     @property
     def seconds(self) -> float:

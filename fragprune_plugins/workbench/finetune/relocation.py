@@ -18,7 +18,7 @@ from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import InputError
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.schedule import Settings
-from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.learning.thresholds import MOMENTS, ThresholdStore
 from fragprune_plugins.plugins.hooks import engine_for
 from fragprune_plugins.types import View
 from fragprune_plugins.workbench.goals import AtMost
@@ -36,7 +36,6 @@ DEEPER = 1.6
 _ROUNDS, _FIRST, _LAST = 10, 0.05, 0.3  # of the run: what moves later has not settled at its end
 _APART = 0.7  # twins' distance from the whole, over its longest axis: they are as long together
 _OPACITY = 0.7  # of a twin, over that of the whole
-_MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 def relocates(model: Model, settings: Settings) -> bool:
@@ -80,16 +79,14 @@ class Relocation:
 
     def __init__(self, rows: Tensor, count: int, steps: int) -> None:
         known = rows.dtype == torch.int64 and rows.ndim == 1 and 2 * len(rows) <= count
-        if not known or len(set(rows.tolist()) & set(range(count))) != len(rows):
-            found = (
-                f"{rows.dtype} of shape {tuple(rows.shape)}, or a row twice, or one of no Gaussian"
-            )
+        if not known or len(set(rows.tolist())) < len(rows) or ((rows < 0) | (rows >= count)).any():
+            found = f"{rows.dtype} of shape {tuple(rows.shape)}, or a row twice, or of no Gaussian"
             expected = f"torch.int64, at most half of {count} rows, each once"
             raise InputError("relocate", found, expected, "Pass what spare(model, views) gives.")
         self._rows, self._steps = rows, steps
         self.pull = torch.zeros(2, count, device=rows.device)
 
-    def gone(self, step: int) -> int:
+    def moved(self, step: int) -> int:
         """How many have moved when a step is over."""
         over = (step / self._steps - _FIRST) / (_LAST - _FIRST)
         return len(self._rows) * int(_ROUNDS * min(1.0, max(0.0, over))) // _ROUNDS
@@ -104,22 +101,22 @@ class Relocation:
             step: counted from 1.
             model: whose parameters the optimizer moves, all of them; changed in place.
         """
-        if self.gone(step) == len(self._rows) == self.gone(step - 1):
+        if self.moved(step) == len(self._rows) == self.moved(step - 1):
             return
         assert model.xyz.grad is not None
         pull = model.xyz.grad.norm(dim=1) * model.scaling.exp().amax(dim=1)
         self.pull += torch.stack([pull, (pull > 0).float()])
-        leaving = self._rows[self.gone(step - 1) : self.gone(step)]
+        leaving = self._rows[self.moved(step - 1) : self.moved(step)]
         if not len(leaving):
             return
         mean = self.pull[0] / self.pull[1].clamp(min=1)
-        mean[self._rows[self.gone(step - 1) :]] = -1  # what is to go itself
+        mean[self._rows[self.moved(step - 1) :]] = -1  # what is to go itself
         wholes = mean.topk(len(leaving)).indices
         parameters = {group["name"]: group["params"][0] for group in optimizer.param_groups}
         split(parameters, wholes, leaving)
         twins = torch.cat([wholes, leaving])
         for parameter in parameters.values():
-            for moment in _MOMENTS:
+            for moment in MOMENTS:
                 optimizer.state[parameter][moment][twins] = 0
         origins = torch.arange(len(store), device=twins.device)
         fresh = torch.isin(origins, twins)
