@@ -9,7 +9,7 @@ import torch
 from finetune import tiny
 from torch.optim.optimizer import register_optimizer_step_post_hook
 
-from fragprune_plugins import Control, Faster, Pressure, ThresholdStore, finetune
+from fragprune_plugins import Control, Faster, Portable, Pressure, ThresholdStore, finetune
 from fragprune_plugins.adapting import RasterInputs
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import AlignmentError, DivergedError, EngineError, UsageError
@@ -54,6 +54,22 @@ def test_photographs_with_dropout_teach_all_at_four_times_the_rates(
     """Adam's first step is the rate, whatever the gradient: 0.0025 for colours in 3DGS."""
     moved = finetune(model, dataset, settings).model.f_dc - model.f_dc
     assert float(moved.abs().max()) == pytest.approx(0.0025 * times, rel=1e-3)
+
+
+@pytest.mark.parametrize("goal", [Pressure(), Portable(), Control()])
+def test_while_gaussians_move_all_learn_at_four_times_the_rates_and_positions_at_forty(
+    model, dataset, goal
+):
+    none = torch.empty(0, dtype=torch.int64)  # what has moved shows more than Adam's step
+    result = finetune(model, dataset, Settings(iterations=1, goal=goal), relocate=none)
+    for name, rate in {
+        "f_dc": 4 * 0.0025,
+        "scaling": 4 * 0.005,
+        "xyz": 40 * 1.6e-5 * dataset.extent,
+        "opacity": 0.01,
+    }.items():
+        moved = getattr(result.model, name) - getattr(model, name)
+        assert float(moved.abs().max()) == pytest.approx(rate, rel=1e-3), name
 
 
 @pytest.mark.parametrize("part", ["image", "fragments_per_pixel"])

@@ -116,6 +116,8 @@ def command(tmp_path, monkeypatch):
         (BY_HEART - 0.01, (), None, "auto"),
         (BY_HEART - 0.01, ("--keep", 1), None, 1),
         (BY_HEART - 0.01, ("--target-speedup", 1.2), None, None),
+        (BY_HEART, ("--portable",), DROPOUT, KEEP),
+        (BY_HEART - 0.01, ("--portable",), None, "auto"),
     ],
 )
 def test_the_trial_chooses_what_nobody_chose(command, found, options, dropout, keep):
@@ -139,7 +141,6 @@ def test_of_a_pruned_model_no_gaussian_is_removed(command, tmp_path):
         (("--dropout", 0.3), 0.3),
         (("--dropout", 0), 0.0),
         (("--control",), None),
-        (("--portable",), None),
         (("--self",), None),
         (("--train", "opacity"), None),
         (("--max-drop", 5), None),

@@ -41,9 +41,10 @@ from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 # tenth of these rates for shapes cut fewer fragments at no better PSNR.
 _APPEARANCE = {"f_dc": 0.0025, "f_rest": 0.0025 / 20}
 _GEOMETRY = {"xyz": 1.6e-5, "scaling": 0.005, "rotation": 0.001}
-_WITH_DROPOUT = 4.0
-"""Times these rates where photographs teach all of a model with dropout: docs/results.md. Its own
-pictures teach worse so: 29.75 dB in place of 29.89 on fox (--self --dropout 0.2)."""
+_LIVELY = 4.0
+"""Times these rates where photographs teach all of a model with dropout, or while Gaussians move:
+docs/results.md. Its own pictures teach worse so: 29.75 dB in place of 29.89 on fox (--self
+--dropout 0.2)."""
 _POSTFIXES = 100  # times in a run that the bar says how it goes
 
 _OF_VIEWS = {"before", "after"}  # of stage 2's tensors; all others have a row for each Gaussian
@@ -136,7 +137,8 @@ class Training:
             target=target,
             everywhere=processes.everywhere,
         )
-        rates, self.relocation = rates_of(settings, dataset.extent), None
+        lively = relocate is not None or bool(settings.dropout and not settings.itself)
+        rates, self.relocation = rates_of(settings, dataset.extent, lively=lively), None
         if relocate is not None:
             rates["xyz"] *= POSITIONS
             self.relocation = Relocation(relocate, len(start), settings.iterations)
@@ -355,15 +357,15 @@ class Training:
         return drawn_by(self.engine, replace(inputs, stop=None), None)
 
 
-def rates_of(settings: Settings, extent: float) -> dict[str, float]:
+def rates_of(settings: Settings, extent: float, *, lively: bool) -> dict[str, float]:
     """Initial learning rates of the parameters that train, by name, in steps of one view."""
     rates = {"opacity": settings.opacity_lr}
     if settings.train in ("appearance", "all"):
         rates |= _APPEARANCE
     if settings.train == "all":
         rates |= _GEOMETRY | {"xyz": _GEOMETRY["xyz"] * extent}
-    if settings.dropout and settings.train == "all" and not settings.itself:
-        rates |= {name: _WITH_DROPOUT * rate for name, rate in rates.items() if name != "opacity"}
+    if lively and settings.train == "all":
+        rates |= {name: _LIVELY * rate for name, rate in rates.items() if name != "opacity"}
     return rates
 
 

@@ -60,7 +60,7 @@ def tried(
     """
     chosen = settings.dropout is not None or settings.itself or settings.train != "all"
     asked = Trial(settings, keep)
-    if chosen or not settings.goal.learns or isinstance(settings.goal, AtMost):
+    if chosen or not settings.goal.presses or isinstance(settings.goal, AtMost):
         return asked
     lost = forgotten(model, dataset, engine=engine, seed=settings.seed, say=say)
     if lost is None:
