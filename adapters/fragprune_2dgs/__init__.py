@@ -32,11 +32,7 @@ class SurfelDialect(GraphdecoDialect):
     """Vanilla's call of 2023 with two scales; a stack of seven maps comes third."""
 
     def unpack(self, call: HostCall) -> RasterInputs:
-        """Translate the call.
-
-        Raises:
-            InputError: the host passed matrices instead of scales and rotations.
-        """
+        """Translate the call; InputError for matrices instead of scales and rotations."""
         if call.get("cov3D_precomp") is not None:
             found = "cov3D_precomp, the surfels' matrices, of which the host draws no normals"
             remedy = "Leave out --compute_cov3D_python."

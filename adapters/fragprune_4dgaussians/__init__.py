@@ -37,11 +37,8 @@ from fragprune_plugins.adapting import (
     revised,
 )
 
-OUTPUTS = 3
-"""Colour, radii and depth."""
-
-STATE = 12
-"""The place of the optimizer's state in a checkpoint."""
+OUTPUTS = 3  # colour, radii and depth
+STATE = 12  # the place of the optimizer's state in a checkpoint
 
 _NETWORK = UntrustedFile(
     ModelFileError,
@@ -49,7 +46,6 @@ _NETWORK = UntrustedFile(
     "deformation.pth and deformation_table.pth, which the host writes beside a PLY",
     "Name a checkpoint instead.",
 )
-
 
 GROUPS = ("OptimizationParams", "ModelHiddenParams", "ModelParams", "PipelineParams")
 """The dicts of a configuration that the host reads, in its order. An argument's last value wins."""
@@ -90,21 +86,14 @@ class MovingDialect(GraphdecoDialect):
     returned = ("image", "radii", "depth")
 
     def unpack(self, call: HostCall) -> RasterInputs:
-        """Translate the call.
-
-        Matrices of PanopticSports scenes have one more dimension, of size 1.
-        """
+        """Translate the call; matrices of PanopticSports scenes have a dimension of size 1 more."""
         s = call.settings
         flat = {name: getattr(s, name).reshape(4, 4) for name in ("viewmatrix", "projmatrix")}
         return super().unpack(replace(call, settings=s._replace(**flat)))
 
 
 def completed(call: SeamCall) -> Any:
-    """Add to a checkpoint made from a PLY what only the new model has.
-
-    These are the scene's extent and the optimizer's groups, whose number of parameters depends on
-    the network.
-    """
+    """Add to a checkpoint made from a PLY the new model's extent, and groups as its network has."""
     capture = list(call.first)
     if not capture[STATE]["param_groups"]:
         capture[STATE] = capture[STATE] | call.model.optimizer.state_dict()
@@ -171,14 +160,8 @@ class MovingGaussians(GraphdecoAdapter):
         missing += [] if "_{stage}_" in text else ["no checkpoints of a phase in train.py"]
         return [*super().fingerprint(repo), *self.other_host(repo, missing)]
 
-    # -- its command line ------------------------------------------------------------------------
-
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
-        """The same command, with the output folder that ``--expname`` means.
-
-        Raises:
-            UsageError: the host would not resume from a file in that folder.
-        """
+        """The same command, with the folder that ``--expname`` means, or UsageError."""
         parser = ArgumentParser(add_help=False)
         parser.add_argument("-m", "--model_path", default="")
         parser.add_argument("--expname", default="")
@@ -196,28 +179,23 @@ class MovingGaussians(GraphdecoAdapter):
         path = str(checkpoint)
         if "fine" in path and "coarse" not in path:
             return
-        of_coarse = checkpoint.name.startswith("chkpnt_coarse")
-        raise UsageError(
-            path,
-            "a checkpoint of the phase coarse" if of_coarse else "a path that the host misreads",
-            "a path with 'fine' and without 'coarse', by which the host tells phases apart",
-            "Finish the training first, with --stage off."
-            if of_coarse
-            else "Rename the file or its folder, or name it by a shorter path.",
-        )
+        found = "a path that the host misreads"
+        remedy = "Rename the file or its folder, or name it by a shorter path."
+        if checkpoint.name.startswith("chkpnt_coarse"):
+            found = "a checkpoint of the phase coarse"
+            remedy = "Finish the training first, with --stage off."
+        expected = "a path with 'fine' and without 'coarse', by which the host tells phases apart"
+        raise UsageError(path, found, expected, remedy)
 
     def view(self, camera: Any) -> int:
         """The camera's number, because the host copies cameras and loads them again.
 
-        Cameras of PanopticSports are dicts without a number: their moment and place tell them
-        apart.
+        Cameras of PanopticSports are dicts without: their moment and place tell them apart.
         """
         if isinstance(camera, dict):
             place = camera["camera"].viewmatrix.flatten().tolist()
             return hash((camera["time"], *place))
         return int(camera.uid)
-
-    # -- its files -------------------------------------------------------------------------------
 
     def save_model(self, model: Any, output: Path, iteration: int) -> Path:
         """Save PLY and network, as ``scene.save`` does."""

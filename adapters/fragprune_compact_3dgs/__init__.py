@@ -24,10 +24,8 @@ from fragprune_plugins.adapting import (
     revised,
 )
 
-NETWORK = "network"
-"""Our name for the param group of the hash grid and the colour network, which has none."""
-PP = "_pp.npz"
-"""Ends the name of a file whose attributes are coded further."""
+NETWORK = "network"  # our name for the param group of hash grid and colour network
+PP = "_pp.npz"  # ends the name of a file whose attributes are coded further
 
 
 def ended(call: SeamCall, by: str) -> Path:

@@ -38,15 +38,11 @@ if TYPE_CHECKING:
 
 PACKAGE, MCMC, REDUCED = "gaussian_splatting", "gaussian_splatting_mcmc", "reduced_3dgs"
 MODEL, TRAINER = f"{PACKAGE}.gaussian_model", f"{PACKAGE}.trainer"
+DENSIFY = f"{TRAINER}.densifier.trainer", "DensificationTrainer.densify_and_prune"
 RASTERIZER = f"{PACKAGE}.diff_gaussian_rasterization"
 RELOCATION = f"{MCMC}.trainer.diff_gaussian_rasterization"
-PRUNING = tuple(
-    f"{REDUCED}.{name}._C"
-    for name in (
-        *("diff_gaussian_rasterization", "importance.diff_gaussian_rasterization"),
-        "simple_knn",
-    )
-)
+REDUCING = ("diff_gaussian_rasterization", "importance.diff_gaussian_rasterization", "simple_knn")
+PRUNING = tuple(f"{REDUCED}.{name}._C" for name in REDUCING)
 """What MCMC's training script imports for modes that we do not know."""
 
 
@@ -158,13 +154,7 @@ class GaussianSplatting(GraphdecoAdapter):
         rasterizer_seam(RASTERIZER),
         Seam(Role.LOSS, "torch", "Tensor.backward", external=True),
         Seam(Role.METRIC, f"{PACKAGE}.utils.lpipsPyTorch", "lpips"),
-        Seam(
-            Role.REARRANGE,
-            f"{TRAINER}.densifier.trainer",
-            "DensificationTrainer.densify_and_prune",
-            ("loss", "out", "camera"),
-            how=tracing,
-        ),
+        Seam(Role.REARRANGE, *DENSIFY, ("loss", "out", "camera"), how=tracing),
         Seam(Role.STILL, f"{TRAINER}.opacity_reset", "OpacityResetter.optim_step", how=step_alone),
         Seam(Role.STILL, f"{TRAINER}.sh_lift", "SHLifter.oneupSHdegree"),
         Seam(Role.SAVE, MODEL, "GaussianModel.save_ply", ("path",)),
@@ -197,12 +187,11 @@ class GaussianSplatting(GraphdecoAdapter):
 
     def photographs(self, repo: HostRepo, arguments: list[str]) -> NoReturn:
         """Refuse: the package trains on every view."""
-        raise NotComparedError(
-            "gaussian-splatting (pip)",
-            "a package that trains on every view",
-            "views that are held out",
-            "Leave some views out of the COLMAP model, then run fragprune compare on all of them.",
+        where, found = "gaussian-splatting (pip)", "a package that trains on every view"
+        remedy = (
+            "Leave some views out of the COLMAP model, then run fragprune compare on all of them."
         )
+        raise NotComparedError(where, found, "views that are held out", remedy)
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
         """The command for stage 2; if cameras were trained, it takes those of stage 1."""
@@ -220,16 +209,12 @@ class GaussianSplatting(GraphdecoAdapter):
         model = call.arguments.get("model", call.arguments.get("gaussians"))
         model = getattr(call.instance, "model", call.instance) if model is None else model
         if type(model).__module__.startswith(f"{PACKAGE}.models"):
-            raise SessionError(
-                f"{type(model).__name__}", "a model of --backend gsplat", "inria", "Change it."
-            )
+            name, found = type(model).__name__, "a model of --backend gsplat"
+            raise SessionError(name, found, "inria", "Change it.")
         return model
 
     def view(self, camera: Any) -> int:
-        """A key of the camera: its matrix.
-
-        Cameras are tuples, which hosts copy to change a background.
-        """
+        """A key of the camera: its matrix. Cameras are tuples, which hosts copy."""
         return id(camera.world_view_transform)
 
 
@@ -238,12 +223,7 @@ def _without_rider(colour: Tensor | None) -> Tensor | None:
 
 
 def _follow(instruct: Any, numbers: Tensor) -> tuple[Tensor, Tensor]:
-    """The origins of the rows after an instruction, and which rows are new or overwritten.
-
-    Args:
-        instruct: the host's instruction: replace, then remove, then add.
-        numbers: (N,) int32, the rows before the instruction.
-    """
+    """The origins of rows (N,) int32 after an instruction, and which are new or overwritten."""
     import torch
 
     def carried(colour: Tensor) -> Tensor:

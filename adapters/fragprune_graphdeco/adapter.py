@@ -108,8 +108,7 @@ MODEL_SEAMS: tuple[Seam, ...] = (
 
 Value = TypeVar("Value", float, str)
 
-SCREEN = 3
-"""Columns of the tensor that gets the gradient on the screen."""
+SCREEN = 3  # columns of the tensor that gets the gradient on the screen
 
 
 @cache
@@ -389,11 +388,8 @@ class GraphdecoAdapter(ScriptAdapter):
     def dialect(self, repo: HostRepo) -> GraphdecoDialect:
         """The dialect for the arguments and outputs of the first of ``calls`` in the source."""
         call = self._first_call(repo)
-        return self.dialect_type(
-            package=self.package,
-            settings=call.settings if call else (),
-            outputs=(call.outputs if call else None) or 2,
-        )
+        settings, outputs = (call.settings, call.outputs) if call else ((), None)
+        return self.dialect_type(self.package, settings, outputs or 2)
 
     def _first_call(self, repo: HostRepo) -> CallInSource | None:
         """The first of ``calls`` in the source."""
@@ -409,10 +405,7 @@ class GraphdecoAdapter(ScriptAdapter):
         return tuple(one) or self.scripts
 
     def command_line(self, repo: HostRepo) -> CommandLine:
-        """The flags of ``train.py``; the iteration count's default is read from the source.
-
-        The last iteration takes no step.
-        """
+        """The flags of ``train.py``, with the source's default of iterations."""
         line = CommandLine(
             scripts=self.scripts_of(repo),
             iterations="--iterations",
@@ -438,11 +431,7 @@ class GraphdecoAdapter(ScriptAdapter):
     def numbers(
         self, repo: HostRepo, script: Path, arguments: list[str], names: Iterable[str]
     ) -> dict[str, list[int]]:
-        """Numbers of a training command by argument, for those arguments that the source has.
-
-        Raises:
-            UsageError: a value is no number, or the configuration file cannot be read.
-        """
+        """Numbers of a command, of those arguments that the source has, or UsageError."""
         defaults = {name: numbers(repo, script, name) for name in names}
         known = {name: default for name, default in defaults.items() if default}
         options = {name: {"type": int, "nargs": "+", "default": known[name]} for name in known}
@@ -539,12 +528,9 @@ class GraphdecoAdapter(ScriptAdapter):
             found, remedy = self.undrawn
             raise NotComparedError(self.info.title, found, "models that we can draw", remedy)
         for found in self.not_drawn(repo, arguments):
-            raise NotComparedError(
-                "the host's command",
-                found,
-                "pictures as the host draws them",
-                "Draw and measure with the host's render.py and metrics.py.",
-            )
+            expected = "pictures as the host draws them"
+            remedy = "Draw and measure with the host's render.py and metrics.py."
+            raise NotComparedError("the host's command", found, expected, remedy)
         return {"compensation": "antialiasing"} if self._compensated(repo, arguments) else {}
 
     def _compensated(self, repo: HostRepo, arguments: list[str]) -> bool:
@@ -599,11 +585,7 @@ def group_names(function: Function | None) -> tuple[str, ...]:
 def resolution(repo: HostRepo, asked: int | None) -> Resolution:
     """The resolution for the host's ``-r``: a divisor, at most 1,600 pixels, or a width.
 
-    Args:
-        asked: the flag's value; None if the command lacks it.
-
-    Raises:
-        NotComparedError: the host chooses sizes in another way.
+    NotComparedError if the host chooses sizes in another way.
     """
     tree = repo.tree(CAMERAS)
     divisors = {
@@ -619,12 +601,11 @@ def resolution(repo: HostRepo, asked: int | None) -> Resolution:
     capped = any(node.value == WIDEST for node in every(tree, ast.Constant))
     value = int(default(repo, "_resolution", -1)) if asked is None else asked
     if not divisors or not capped or (value < 1 and value != -1):
-        raise NotComparedError(
-            f"-r {value}" if divisors and capped else repo.place(CAMERAS, "loadCam"),
-            "an image size that our readers cannot reproduce",
-            f"a divisor, a width, or -1: at most {WIDEST} pixels wide, as vanilla has it",
-            "Measure with fragprune compare --resolution, or with the host's own metrics.py.",
-        )
+        where = f"-r {value}" if divisors and capped else repo.place(CAMERAS, "loadCam")
+        found = "an image size that our readers cannot reproduce"
+        expected = f"a divisor, a width, or -1: at most {WIDEST} pixels wide, as vanilla has it"
+        remedy = "Measure with fragprune compare --resolution, or with the host's own metrics.py."
+        raise NotComparedError(where, found, expected, remedy)
     return Resolution.asked(value, divisors)
 
 

@@ -62,20 +62,12 @@ class RasterizerCall:
 
 @dataclass(frozen=True)
 class CallInSource(RasterizerCall):
-    """A rasterizer call, with its place in the source and its package filled in.
+    """A rasterizer call, with its place in the source and its package filled in."""
 
-    Attributes:
-        settings: names of the settings, in order.
-        line: where its result is assigned.
-        names: of the values, unpacked at the call or later, in order; "" where one is no plain
-            name. Empty if that was not read.
-        given: arguments and settings by name.
-    """
-
-    settings: tuple[str, ...] = ()
-    line: int = 0
-    names: tuple[str, ...] = ()
-    given: Mapping[str, ast.expr] = field(default_factory=dict, compare=False)
+    settings: tuple[str, ...] = ()  # names, in order
+    line: int = 0  # where its result is assigned
+    names: tuple[str, ...] = ()  # of the values; "" for no plain name, () if they were not read
+    given: Mapping[str, ast.expr] = field(default_factory=dict, compare=False)  # by name
 
     @property
     def other_matrix(self) -> str:
@@ -110,10 +102,7 @@ def _makes_settings(repo: HostRepo, module: str, function: Function) -> bool:
 
 @lru_cache(maxsize=64)  # of the adapters, many ask
 def read_calls(repo: HostRepo, module: str, function: str) -> tuple[CallInSource, ...]:
-    """How a function calls the rasterizer, once for each place that does.
-
-    Empty if the function is absent or makes no settings.
-    """
+    """How a function calls the rasterizer, once for each place; empty without any, or settings."""
     body = repo.function(module, function)
     if body is None:
         return ()

@@ -15,11 +15,7 @@ Needy = Callable[[Mapping[str, Any], int, Callable[..., "Tensor"]], "Tensor"]
 
 
 def needy(arguments: Mapping[str, Any], rows: int, flat: Callable[..., Tensor]) -> Tensor:
-    """(rows,) bool: rows whose screen gradient makes a densify method add Gaussians.
-
-    Args:
-        flat: (n, 1) -> (n,), the method's own reduction, so that rounding agrees at the threshold.
-    """
+    """(rows,) bool: rows to copy by their gradient; ``flat`` reduces (n, 1) as the method does."""
     return reaches(flat(arguments["grads"], dim=-1), arguments["grad_threshold"], rows)
 
 

@@ -21,8 +21,7 @@ _LOSS = re.compile(r"l1|l2|ssim|mse|huber|charbonnier|lpips|loss", re.IGNORECASE
 _PHOTOGRAPH = re.compile(r".+\.(original_image|image|get_image\(\))")
 _BESIDE = re.compile(r"(\w+\.)*(\w*alpha_mask|background|bg|bg_color)(\.cuda\(\))?")
 """What a photograph with an alpha channel, and the picture with it, are cut by or put on."""
-_MASK = re.compile(r"(?<!alpha_)mask|conf(?!ig)|uncert|valid(?!at)")
-"""In names of what weighs a loss at each pixel."""
+_MASK = re.compile(r"(?<!alpha_)mask|conf(?!ig)|uncert|valid(?!at)")  # in names of a loss's weights
 _CHANGES = re.compile(
     r"self\.(FoV[xy] ([*/+-]=|= (self\.)?FoV[xy] )|"
     r"original_image (\*\*=|=.*(\*\* |\.(pow|mean)\()))",

@@ -1,7 +1,6 @@
 """Proves that a rasterizer of these hosts and our engine draw the same.
 
-A call is drawn by both, with the host's own arguments and again with a chart of Gaussians that
-shows every rule.
+A call is drawn by both, as the host makes it and again with Gaussians that show every rule.
 """
 
 from __future__ import annotations
@@ -249,9 +248,8 @@ class _Trial:
             if not name or likeness.difference(theirs[0], _made(name, own.seen), own.slack):
                 if unread:
                     return "something unknown that is not read", False
-                raise _OtherwiseError(
-                    f"{self._called(number)}, which the host uses, is unknown: {told}"
-                )
+                unknown = f"{self._called(number)}, which the host uses, is unknown"
+                raise _OtherwiseError(f"{unknown}: {told}")
             ours = [_made(name, each.seen) for each in both]
         if unread and not is_picture:
             return name, new
@@ -291,11 +289,6 @@ def _gradient(output: Any, leaves: dict[str, Tensor]) -> dict[str, Tensor | None
     if not leaves or not isinstance(output, Tensor) or not output.requires_grad:
         return dict.fromkeys(leaves)
     weights = torch.rand(output.numel(), generator=torch.Generator().manual_seed(0)) - 0.3
-    found = torch.autograd.grad(
-        output,
-        list(leaves.values()),
-        weights.reshape(output.shape).to(output),
-        allow_unused=True,
-        retain_graph=True,
-    )
+    given = output, list(leaves.values()), weights.reshape(output.shape).to(output)
+    found = torch.autograd.grad(*given, allow_unused=True, retain_graph=True)
     return dict(zip(leaves, found, strict=True))

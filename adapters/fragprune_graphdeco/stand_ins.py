@@ -1,7 +1,6 @@
 """Stand-ins: our modules under the import names of the hosts' compiled packages.
 
-They are used if the compiled package cannot be imported or the run has no GPU. The call is the
-same; our engine draws.
+They are used if the package cannot be imported or the run has no GPU. Our engine draws the call.
 """
 
 from __future__ import annotations
@@ -38,11 +37,8 @@ def rasterizer(
 ) -> ModuleType:
     """The rasterizer package: settings, rasterizer and MCMC's relocation.
 
-    It has no SparseGaussianAdam, which hosts since October 2024 look for: they do without.
-
-    Args:
-        settings: field names of the settings tuple, in order.
-        also: further methods of the rasterizer, called like ``forward``.
+    It has no SparseGaussianAdam, which hosts since October 2024 look for: they do without. Methods
+    ``also`` are called like ``forward``.
     """
     fields = [(name, Any) for name in settings]
     settings_type = NamedTuple("GaussianRasterizationSettings", fields)  # type: ignore[misc]
@@ -100,7 +96,7 @@ def simple_knn() -> dict[str, ModuleType]:
 def mean_squared_neighbour_distance(points: Tensor) -> Tensor:
     """(N, 3) -> (N,) mean of the squared distances to the three nearest other points.
 
-    Points with fewer than three neighbours average over those they have; a lone point gives 0.
+    Fewer neighbours are averaged as they are; a lone point gives 0.
     """
     from scipy.spatial import cKDTree
 

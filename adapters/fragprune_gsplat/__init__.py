@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fragprune_plugins.adapting import (
+    GROUPS,
     HostAdapter,
     HostInfo,
     HostRepo,
@@ -38,26 +39,19 @@ PACKAGE = "gsplat"
 RENDERING, OPERATIONS = f"{PACKAGE}.rendering", f"{PACKAGE}.strategy.ops"
 EXPORTER = f"{PACKAGE}.exporter"
 BASE = f"{PACKAGE}.strategy.base"
+RELOCATED = ("opacities", "scales", "ratios", "binoms")
+SHAPED = ("quats", "scales", "compute_covar", "compute_preci", "triu")
 DEFAULT, MCMC = f"{PACKAGE}.strategy.default", f"{PACKAGE}.strategy.mcmc"
-DRAWN = ("means", "opacities", "viewmats", "Ks", "covars")
-"""Arguments of ``rasterization``."""
+DRAWN = ("means", "opacities", "viewmats", "Ks", "covars")  # arguments of ``rasterization``
 LPIPS = Seam(
     Role.METRIC, "torchmetrics.image.lpip", "LearnedPerceptualImagePatchSimilarity", external=True
 )
 """With what gsplat's trainer and nerfstudio measure."""
-ROWS = "fragprune_rows"
-"""Key under which row numbers ride along while a strategy changes rows."""
-DRIFT = 1e-3
-"""How far the numbers of a pose that learns move from one visit to the next, at most."""
-GROUPS = {
-    "means": "xyz",
-    "sh0": "f_dc",
-    "shN": "f_rest",
-    "opacities": "opacity",
-    "scales": "scaling",
-    "quats": "rotation",
-}
-"""gsplat's keys and what the rest of the field calls them."""
+ROWS = "fragprune_rows"  # key under which row numbers ride along while a strategy changes rows
+DRIFT = 1e-3  # how far the numbers of a pose that learns move from one visit to the next, at most
+KEYS = ("means", "sh0", "shN", "opacities", "scales", "quats")
+NAMES = {key: group.name for key, group in zip(KEYS, GROUPS, strict=True)}
+"""What the rest of the field calls gsplat's keys."""
 
 
 def optimizers(call: SeamCall) -> list[Any]:
@@ -105,11 +99,7 @@ def answered(module: str, name: str, *needs: str, by: str) -> Seam:
 
 
 def surfels(call: SeamCall) -> None:
-    """Refuse a step of a training that draws surfels, which would count and learn nothing.
-
-    Raises:
-        InputError: always.
-    """
+    """Refuse a step of a training that draws surfels, which would count and learn nothing."""
     found, remedy = "surfels, which have no cutoffs here", "Train without fragprune, or train 2DGS "
     remedy += "in its own repository, which fragprune knows."
     raise InputError(str(call.seam), found, "gsplat.rasterization", remedy)
@@ -122,10 +112,7 @@ class Splats(dict[str, Any]):
 
 
 def splats_in(saved: Any) -> Splats | None:
-    """The parameters in a dict, or in one inside it; None without any.
-
-    gsplat's own trainer has them under "splats".
-    """
+    """The parameters in a dict, or in one inside it as gsplat's trainer has them; else None."""
     import torch
 
     kinds, names = (Mapping, torch.nn.ParameterDict), ("means", "quats", "opacities")
@@ -183,18 +170,8 @@ class Gsplat(HostAdapter):
         Seam(Role.STILL, DEFAULT, "DefaultStrategy.step_pre_backward", ("params",)),
         Seam(Role.STILL, DEFAULT, "DefaultStrategy.step_post_backward", ("params",)),
         Seam(Role.STILL, MCMC, "MCMCStrategy.step_post_backward", ("params",)),
-        answered(
-            "relocation",
-            "compute_relocation",
-            *("opacities", "scales", "ratios", "binoms"),
-            by="relocation",
-        ),
-        answered(
-            "cuda._wrapper",
-            "quat_scale_to_covar_preci",
-            *("quats", "scales", "compute_covar", "compute_preci", "triu"),
-            by="covariance",
-        ),
+        answered("relocation", "compute_relocation", *RELOCATED, by="relocation"),
+        answered("cuda._wrapper", "quat_scale_to_covar_preci", *SHAPED, by="covariance"),
         answered("distributed", "cli", "fn", "args", by="alone"),
         Seam(Role.SAVE, "torch", "save", ("f", "obj"), external=True),
         Seam(Role.UNPACK, "torch", "load", ("f",), external=True, how=read_again),
@@ -209,8 +186,8 @@ class Gsplat(HostAdapter):
     def dialect(self, repo: HostRepo) -> GsplatDialect:
         """The version's dialect, read off its source.
 
-        Until 1.4 the extents are squares of 3 sigma. Until 1.5 alpha's cap is 0.999, and
-        antialiasing has no floor.
+        Until 1.4 extents are squares of 3 sigma. Until 1.5 alpha's cap is 0.999, and antialiasing
+        has no floor.
         """
         from fragprune_gsplat.dialect import GsplatDialect
 
@@ -248,7 +225,7 @@ class Gsplat(HostAdapter):
     def group_name(self, model: Any, group: Mapping[str, Any]) -> str | None:
         """The name of the group's parameter, because users name groups freely or not at all."""
         (parameter,) = group["params"]
-        return next((GROUPS.get(key, key) for key, own in model.items() if own is parameter), None)
+        return next((NAMES.get(key, key) for key, own in model.items() if own is parameter), None)
 
     def means(self, model: Any) -> Tensor:
         """(N, 3) the parameter itself."""

@@ -51,9 +51,7 @@ def covariance(call: SeamCall) -> tuple[Tensor, None]:
 def alone(call: SeamCall) -> Any:
     """Run a training in this process, which gsplat does on one GPU alone.
 
-    Raises:
-        EngineError: gsplat would start a process for each of several GPUs; thresholds would be
-            missing there.
+    EngineError for several GPUs: thresholds would be missing in gsplat's process for each.
     """
     given, count = call.arguments, torch.cuda.device_count()
     if count > 1:

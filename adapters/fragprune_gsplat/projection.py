@@ -15,16 +15,13 @@ from torch import Tensor
 from fragprune_plugins.adapting import ALPHA_MIN
 
 TILE = 16
-EXTENT, SQUARE = 3.33, 3.0
-"""In sigma, the furthest that gsplat looks: since 1.5 per axis, until 1.4 along the longer one."""
-MARGIN = 0.3
-"""Of the tangent of the half field of view: how far beyond the image the Jacobian is evaluated."""
+EXTENT, SQUARE = 3.33, 3.0  # in sigma: since 1.5 per axis, until 1.4 along the longer one
+MARGIN = 0.3  # of the tangent of the half field of view, beyond the image, for the Jacobian
 C0 = 0.28209479177387814
 C1 = 0.4886025119029199
 C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 C3 = (-0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154)
-C3_2 = 1.445305721320277
-"""Of real spherical harmonics with the signs of 3DGS."""
+C3_2 = 1.445305721320277  # of real spherical harmonics with the signs of 3DGS
 
 
 @dataclass(frozen=True)
@@ -92,12 +89,8 @@ def project(
 ) -> Projection:
     """Project N Gaussians; differentiable in means, covars, opacities and viewmat.
 
-    Args:
-        means: (N, 3) world.
-        covars: (N, 3, 3) world.
-        opacities: (N,) activated.
-        viewmat: (4, 4) world to camera, acting on column vectors.
-        K: (3, 3) intrinsics.
+    Means (N, 3) and covars (N, 3, 3) are in the world, opacities (N,) activated; viewmat (4, 4)
+    acts on column vectors, K (3, 3) has the intrinsics.
     """
     rotation = viewmat[:3, :3]
     seen = product(means[:, None], rotation.T)[:, 0] + viewmat[:3, 3]

@@ -27,8 +27,7 @@ from fragprune_plugins.adapting import (
     UsageError,
 )
 
-LISTS = {"eval_steps", "save_steps", "ply_steps"}
-"""Flags that list steps at which the script evaluates and saves."""
+LISTS = {"eval_steps", "save_steps", "ply_steps"}  # at these it evaluates and saves
 ONLY = {
     "steps-scaler": ("1", "1.0"),
     "compression": ("None",),
@@ -39,8 +38,7 @@ ONLY = {
     "app-opt": ("False",),  # colours of a network's, infinite where a point is black or white
 }
 """Flags with values that stage 2 cannot follow; these values it can."""
-NEAR = 0.01
-"""The near plane of ``rasterization``."""
+NEAR = 0.01  # the near plane of ``rasterization``
 _OWN_FIGURES = "Compare its own figures of held-out views, stats/val_step*.json in --result_dir."
 DEFINES = ("create_splats_with_optimizers", "Runner.train", "main")
 
@@ -110,12 +108,9 @@ class SimpleTrainer(Gsplat, ScriptAdapter):
         )
 
     def refuse(self, repo: HostRepo, arguments: list[str], *, stage: str, device: str) -> None:
-        """Refuse flags that stage 2 cannot follow.
+        """Refuse flags that stage 2 cannot follow, by UsageError.
 
         Absolute gradients are gsplat's own to compute, on a GPU and where no thresholds learn.
-
-        Raises:
-            UsageError: names the flag.
         """
         theirs = {"strategy.absgrad"} if device != "cpu" and stage != "joint" else set()
         for name, values in given(arguments).items():
@@ -165,11 +160,7 @@ class SimpleTrainer(Gsplat, ScriptAdapter):
         return Photographs(folder, images=images, centred=False, opaque=True)
 
     def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any]:
-        """Near plane, gsplat's cap on alpha, and the factor that ``--antialiased`` asks for.
-
-        Raises:
-            NotComparedError: a far plane hides something.
-        """
+        """Near plane, gsplat's cap on alpha, ``--antialiased``; no far plane: NotComparedError."""
         flags, names = given(arguments), [word.replace("_", "-") for word in arguments]
         if "far-plane" in flags:
             where, found = "gsplat's simple_trainer", "a far plane, which our readers do not have"

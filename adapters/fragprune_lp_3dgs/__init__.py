@@ -46,20 +46,14 @@ class LP3DGSDialect(GraphdecoDialect):
     unneeded = SILENT
 
     def unpack(self, call: HostCall) -> RasterInputs:
-        """Translate the call.
-
-        Raises:
-            EngineError: the host wants another score.
-        """
+        """Translate the call; EngineError if the host wants another score."""
         foreign = [n for n in SCORES if n != "bw_score" and getattr(call.settings, n)]
         if foreign:
-            raise EngineError(
-                "the rasterizer's scores",
-                f"{foreign[0]}, which RadSplat's pruning follows",
-                "bw_score or none: our engines compute no other",
-                "Train with the host's own rasterizer and start from what it saved with "
-                "--stage finetune.",
-            )
+            found = f"{foreign[0]}, which RadSplat's pruning follows"
+            expected = "bw_score or none: our engines compute no other"
+            remedy = "Train with the host's own rasterizer and start from what it saved with "
+            remedy += "--stage finetune."
+            raise EngineError("the rasterizer's scores", found, expected, remedy)
         return super().unpack(call)
 
     def values(self, call: HostCall) -> tuple[str, ...]:
@@ -112,11 +106,7 @@ class LP3DGS(GraphdecoAdapter):
     )
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
-        """The same script; refuse the prune method with a model of its own.
-
-        Raises:
-            UsageError: ``--prune_method compact_3dgs``.
-        """
+        """The same script; UsageError for the prune method with a model of its own."""
         if "compact_3dgs" in arguments or "--prune_method=compact_3dgs" in arguments:
             where = "--prune_method compact_3dgs"
             found = "a model with a mask among its parameters, and a resume that fails in the host"

@@ -40,9 +40,7 @@ def following_copies(call: SeamCall) -> Iterator[RowTrace]:
     """Note the parents that the host draws, whose copies overwrite dead rows or are appended.
 
     The host hands them to ``_update_params``, which makes the copies. It drops the moments of both.
-
-    Raises:
-        AlignmentError: the new rows are not copies of the parents.
+    AlignmentError if the new rows are no copies.
     """
     import torch
 

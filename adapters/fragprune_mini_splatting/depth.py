@@ -19,23 +19,19 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-TILE = 16
-"""Pixels; a Gaussian reaches at most its radius and the rest of a tile."""
+TILE = 16  # pixels; a Gaussian reaches at most its radius and the rest of a tile
 
 
 @torch.no_grad()
 def render_depth(
     inputs: RasterInputs, draw: Callable[[RasterInputs], RasterOutputs]
 ) -> dict[str, Tensor]:
-    """Draw the host's six pictures.
+    """Draw the host's six pictures of one view, with scores.
 
     If the middle is behind the camera, the host's fragment colours the pixel, but does not win it
     and does not hide later fragments. This finds such fragments and draws their pixels again
     without them. Winner and transmittance are then the host's; only ``render`` lacks the colour of
     these fragments.
-
-    Args:
-        inputs: of one view, with scores.
 
     Returns:
         ``render`` (3, H, W), ``out_pts`` (3, H, W) world, ``rendered_depth``, ``discriminants`` and

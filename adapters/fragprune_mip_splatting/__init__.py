@@ -41,8 +41,7 @@ class MipDialect(GraphdecoDialect):
         )
 
 
-ABSOLUTE = ("grads_abs", "grad_abs_threshold")
-"""What densification is given besides vanilla's gradients and their threshold."""
+ABSOLUTE = ("grads_abs", "grad_abs_threshold")  # besides vanilla's gradients
 
 
 def either(arguments: Mapping[str, Any], rows: int, flat: Callable[..., Tensor]) -> Tensor:

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from fragprune_gsplat import DRAWN, LPIPS, Gsplat
 from fragprune_plugins.adapting import (
+    GROUPS,
     AlignmentError,
     Dialect,
     Finding,
@@ -38,15 +39,11 @@ PACKAGE = "nerfstudio"
 METHOD = "fragprune-splatfacto"
 SPLATFACTO = f"{PACKAGE}.models.splatfacto"
 MODEL = "fragprune_nerfstudio.model"
-GROUPS = {
-    "means": "xyz",
-    "features_dc": "f_dc",
-    "features_rest": "f_rest",
-    "opacities": "opacity",
-    "scales": "scaling",
-    "quats": "rotation",
-}
-"""splatfacto's keys and what the rest of the field calls them."""
+KEYS = ("means", "features_dc", "features_rest", "opacities", "scales", "quats")
+NAMES = {key: group.name for key, group in zip(KEYS, GROUPS, strict=True)}
+"""What the rest of the field calls splatfacto's keys."""
+BEGIN, EXPORT = "FragpruneSplatfacto.begin_stage2", "ExportGaussianSplat.write_ply"
+WRITTEN = ("filename", "count", "map_to_tensors")
 
 
 def optimizers(call: SeamCall) -> list[Any]:
@@ -58,8 +55,7 @@ def optimizers(call: SeamCall) -> list[Any]:
 def exported(call: SeamCall) -> tuple[Path, Tensor]:
     """The exported PLY, and the model's rows that are in it; none of a model without thresholds.
 
-    Raises:
-        AlignmentError: the file holds other Gaussians than the model. It is removed.
+    A file that holds other Gaussians than the model is removed: AlignmentError.
     """
     import torch
 
@@ -101,27 +97,14 @@ class Nerfstudio(HostAdapter):
     installed = (PACKAGE,)
     seams = (
         # of ours: called where the iteration comes at which stage 2 begins
-        Seam(
-            Role.ATTACH,
-            MODEL,
-            "FragpruneSplatfacto.begin_stage2",
-            ("optimizers",),
-            external=True,
-            how=optimizers,
-        ),
+        Seam(Role.ATTACH, MODEL, BEGIN, ("optimizers",), external=True, how=optimizers),
         Seam(Role.STEP, SPLATFACTO, "SplatfactoModel.step_cb", ("optimizers", "step")),
         Seam(Role.VIEW, SPLATFACTO, "SplatfactoModel.get_outputs", ("camera",)),
         # gsplat's function under the name by which the model calls it
         Seam(Role.RASTERIZE, SPLATFACTO, "rasterization", DRAWN, external=True),
         Seam(Role.LOSS, "torch", "Tensor.backward", external=True),
         LPIPS,
-        Seam(
-            Role.PACK,
-            f"{PACKAGE}.scripts.exporter",
-            "ExportGaussianSplat.write_ply",
-            ("filename", "count", "map_to_tensors"),
-            how=exported,
-        ),
+        Seam(Role.PACK, f"{PACKAGE}.scripts.exporter", EXPORT, WRITTEN, how=exported),
     )
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
@@ -150,7 +133,7 @@ class Nerfstudio(HostAdapter):
     def group_name(self, model: Any, group: Mapping[str, Any]) -> str | None:
         """By the parameter; None for cameras and bilateral grids."""
         own = {id(each): name for name, each in model.gauss_params.items()}
-        return next((GROUPS.get(own.get(id(each), "")) for each in group["params"]), None)
+        return next((NAMES.get(own.get(id(each), "")) for each in group["params"]), None)
 
     def means(self, model: Any) -> Tensor:
         """(N, 3) the parameter itself."""
@@ -163,9 +146,6 @@ class Nerfstudio(HostAdapter):
         return opacities.detach().sigmoid().reshape(-1)
 
     def view(self, camera: Any) -> int:
-        """A key from the camera's pose, because loaders make a new camera for every step.
-
-        It is the same in every process, because checkpoints keep it.
-        """
+        """A key from the camera's pose, the same in every process, because checkpoints keep it."""
         pose = camera.camera_to_worlds.detach().cpu().numpy().tobytes()
         return int.from_bytes(hashlib.blake2b(pose, digest_size=7).digest(), "big")

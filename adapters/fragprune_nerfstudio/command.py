@@ -10,8 +10,7 @@ from fragprune_plugins import Settings
 from fragprune_plugins.adapting import UsageError
 
 HOST = "splatfacto"
-ITERATIONS = 30_000
-"""nerfstudio's default for splatfacto."""
+ITERATIONS = 30_000  # nerfstudio's default for splatfacto
 LENGTH, MODEL = "--max-num-iterations", "--pipeline.model"
 LOADS = ("--load-dir", "--load-checkpoint")
 VARIANTS = {
@@ -40,12 +39,9 @@ def rewritten(
         method: the name of our method.
         stage: "auto" for stage 2 after the training, "finetune" for stage 2 alone, of a checkpoint
             or from ``from_iter`` on.
-        engine: that draws with thresholds.
-        device: "cpu", "cuda" or "cuda:0".
 
     Raises:
-        UsageError: the arguments ask for another method, or for what ns-train cannot do; or for
-            another GPU than the first.
+        UsageError: they ask for another method, what ns-train cannot do, or another GPU.
     """
     if not arguments or arguments[0] not in (HOST, method, *VARIANTS):
         found = arguments[0] if arguments else "no method"
@@ -57,26 +53,18 @@ def rewritten(
     given, rest = _split_off(arguments[1:], LENGTH)
     loads = any(_flag(word) in LOADS for word in rest)
     if any(_flag(word) == "--load-config" for word in rest):
-        raise UsageError(
-            "ns-train --load-config",
-            "a configuration that replaces all other flags",
-            "flags alone",
-            f"Name the checkpoints with {LOADS[0]}, and give the other flags again.",
-        )
+        where, found = "ns-train --load-config", "a configuration that replaces all other flags"
+        remedy = f"Name the checkpoints with {LOADS[0]}, and give the other flags again."
+        raise UsageError(where, found, "flags alone", remedy)
     if stage not in ("auto", "finetune"):
-        raise UsageError(
-            f"--stage {stage}",
-            "ns-train",
-            "auto or finetune",
-            "Drop --stage; ns-eval, ns-export and the viewer need no fragprune run.",
-        )
+        remedy = "Drop --stage; ns-eval, ns-export and the viewer need no fragprune run."
+        raise UsageError(f"--stage {stage}", "ns-train", "auto or finetune", remedy)
     total = ITERATIONS if given is None else given
     ours: dict[str, Any] = dict(VARIANTS.get(arguments[0], {}))
     if from_iter is not None:
         if from_iter >= total:
-            raise UsageError(
-                "--from-iter", str(from_iter), f"less than {total}", f"Lower it, or raise {LENGTH}."
-            )
+            remedy = f"Lower it, or raise {LENGTH}."
+            raise UsageError("--from-iter", str(from_iter), f"less than {total}", remedy)
         settings = replace(settings, iterations=total - from_iter)
         ours[f"{MODEL}.fragprune-from"] = from_iter
     elif stage == "auto":
@@ -84,12 +72,9 @@ def rewritten(
     elif loads:
         total = settings.iterations
     else:
-        raise UsageError(
-            "--stage finetune",
-            "no checkpoint to start from",
-            f"{LOADS[0]} with a run's nerfstudio_models",
-            f"Add {LOADS[0]} to the command, or --from-iter.",
-        )
+        expected = f"{LOADS[0]} with a run's nerfstudio_models"
+        remedy = f"Add {LOADS[0]} to the command, or --from-iter."
+        raise UsageError("--stage finetune", "no checkpoint to start from", expected, remedy)
     ours |= {f"{MODEL}.fragprune.{name}": value for name, value in flags_of(settings).items()}
     if engine != "auto":
         ours[f"{MODEL}.fragprune-engine"] = engine

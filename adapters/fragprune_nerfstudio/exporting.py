@@ -47,16 +47,9 @@ def rows_exported(params: Mapping[str, Tensor], columns: Mapping[str, Any]) -> T
 
 
 def rows_among(known: Mapping[str, Tensor], chosen: Mapping[str, Tensor], where: str) -> Tensor:
-    """(M,) int64 rows of ``known`` that ``chosen`` has, a selection by values in the same order.
+    """(M,) int64 rows of ``known`` (N, C) that are in ``chosen`` (M, C), in the same order.
 
-    Rows that are equal in every value are selected together, so equal ones keep their order.
-
-    Args:
-        known: (N, C) values of the model, by name.
-        chosen: (M, C) values under the same names.
-
-    Raises:
-        AlignmentError: it is no such selection.
+    Rows that are equal in every value are selected together. AlignmentError if it is no selection.
     """
     ours, theirs = _bits(known), _bits({name: chosen[name] for name in known})
     _, which = np.unique(np.concatenate([ours, theirs]), return_inverse=True)

@@ -38,8 +38,7 @@ from fragprune_plugins.learning.deferred import between_steps
 from fragprune_plugins.learning.interruption import EXIT_CODE, Terminate, sigterm_interrupts
 from fragprune_plugins.learning.stage2 import stored_thresholds
 
-PLAIN = 0.25
-"""gsplat's threshold of plain gradients over that of absolute ones, 0.0002 over 0.0008."""
+PLAIN = 0.25  # gsplat's threshold of plain gradients over that of absolute ones, 0.0002 over 0.0008
 
 # torch's loader is safe by default since 2.6, and nerfstudio's schedulers save NumPy scalars
 if hasattr(torch.serialization, "add_safe_globals"):
@@ -90,13 +89,10 @@ class FragpruneSplatfacto(SplatfactoModel):  # type: ignore[misc]
         expect_no_script()
         session = active_session()
         if session is None:  # it draws, with the thresholds of a checkpoint, and learns nothing
-            fragprune_plugins.activate(
-                "nerfstudio", stage="off", engine=self.config.fragprune_engine
-            )
-        elif session.adapter.name != "nerfstudio":
-            raise SessionError(
-                METHOD, f"a session of {session.adapter.name}", "none", "Deactivate it first."
-            )
+            engine = self.config.fragprune_engine
+            fragprune_plugins.activate("nerfstudio", stage="off", engine=engine)
+        elif (name := session.adapter.name) != "nerfstudio":
+            raise SessionError(METHOD, f"a session of {name}", "none", "Deactivate it first.")
         cpu = torch.device(self.kwargs.get("device", "cpu")).type == "cpu"
         if cpu and self.config.use_absgrad:
             self.config = copy(self.config)
@@ -110,8 +106,6 @@ class FragpruneSplatfacto(SplatfactoModel):  # type: ignore[misc]
         wanted = torch.is_grad_enabled() and self.training
         with _on_cpu(self.device.type == "cpu"), torch.set_grad_enabled(wanted):
             return super().get_outputs(camera)
-
-    # -- training --------------------------------------------------------------------------------
 
     def get_training_callbacks(self, training_callback_attributes: Any) -> list[Any]:
         """As splatfacto, once it is known when stage 2 begins; at the end the gain is said."""
@@ -177,17 +171,12 @@ class FragpruneSplatfacto(SplatfactoModel):  # type: ignore[misc]
             raise SystemExit(EXIT_CODE if by_signal else 130) from told
 
     def beginning(self, trainer: Any) -> int:
-        """The iteration at which stage 2 begins: that of the checkpoint, if it has begun there.
-
-        Raises:
-            UsageError: nothing would be learned, or from nothing, or not as this host trains.
-        """
+        """The iteration at which stage 2 begins, or a checkpoint's began, or UsageError."""
         settings, start = self.config.fragprune.settings(), trainer._start_step
         end = start + trainer.config.max_num_iterations
         if trainer.mixed_precision or trainer.use_grad_scaler:
-            raise UsageError(
-                METHOD, "mixed precision", "float32", "Drop --mixed-precision, --use-grad-scaler."
-            )
+            remedy = "Drop --mixed-precision, --use-grad-scaler."
+            raise UsageError(METHOD, "mixed precision", "float32", remedy)
         if trainer.world_size > 1:
             raise UsageError(METHOD, "several GPUs", "one", "Set --machine.num-devices 1.")
         settings.goal.target()  # refuses what a training alone cannot meet
@@ -196,19 +185,16 @@ class FragpruneSplatfacto(SplatfactoModel):  # type: ignore[misc]
         wanted = self.config.fragprune_from
         begin: int = max(start, end - settings.iterations if wanted is None else wanted)
         if begin == 0 or begin >= end:
-            raise UsageError(
-                METHOD,
-                f"stage 2 from iteration {begin} on in a training of iterations {start} to {end}",
-                "some iterations that train, and some of stage 2 after them",
-                "Change --max-num-iterations or --pipeline.model.fragprune.iterations.",
+            found = (
+                f"stage 2 from iteration {begin} on in a training of iterations {start} to {end}"
             )
+            expected = "some iterations that train, and some of stage 2 after them"
+            remedy = "Change --max-num-iterations or --pipeline.model.fragprune.iterations."
+            raise UsageError(METHOD, found, expected, remedy)
         return begin
 
     def follow_parameters(self, optimizers: Any) -> None:
-        """Give the optimizers the parameters of a loaded checkpoint.
-
-        nerfstudio makes them before it loads, and loading makes new parameters.
-        """
+        """Give the optimizers a checkpoint's parameters: nerfstudio makes them before it loads."""
         for name, parameter in self.gauss_params.items():
             (group,) = (optimizer := optimizers.optimizers[name]).param_groups
             (known,) = group["params"]
@@ -222,11 +208,8 @@ class FragpruneSplatfacto(SplatfactoModel):  # type: ignore[misc]
         learning = isinstance(self.strategy, Still)
         if self.begin is not None and step >= self.begin and not learning:
             fragprune_plugins.deactivate()
-            session = fragprune_plugins.activate(
-                "nerfstudio",
-                settings=self.config.fragprune.settings(),
-                engine=self.config.fragprune_engine,
-            )
+            settings, engine = self.config.fragprune.settings(), self.config.fragprune_engine
+            session = fragprune_plugins.activate("nerfstudio", settings=settings, engine=engine)
             session.output = self.checkpoints
             if self.saved is not None:
                 session.take_up(self, thresholds_of(self.saved))
@@ -267,8 +250,6 @@ class FragpruneSplatfacto(SplatfactoModel):  # type: ignore[misc]
                 f"{done.fragments_before:.2f} -> {done.fragments_after:.2f}"
             )
 
-    # -- checkpoints -----------------------------------------------------------------------------
-
     def get_extra_state(self) -> dict[str, Any]:
         """Thresholds and the state of their learning, for a checkpoint; empty before stage 2."""
         session = active_session()
@@ -303,11 +284,7 @@ def thresholds_of(saved: dict[str, Any]) -> dict[str, Any]:
 
 
 def expect_no_script() -> None:
-    """Refuse an exporter that runs as a script: its copy of the exporter is not ours to follow.
-
-    Raises:
-        AlignmentError: it would export without thresholds.
-    """
+    """Refuse an exporter that runs as a script: its copy would export without thresholds."""
     import __main__
 
     own = getattr(__main__, "ExportGaussianSplat", None)

@@ -60,21 +60,13 @@ def run(
         module: the module's name in ``python -m module``; "" for a script.
 
     Raises:
-        UsageError: the method cannot do what the command or the options ask for.
         HostFailed: the host failed, or ended before the end of stage 2.
-        RanksError: several processes train the model together.
     """
     started, recorder, plugins = time.perf_counter(), Recorder(), installed()
     ranks.expect_one()
     device = process.host_device(options.device, options.engine)
-    words = rewritten(
-        arguments,
-        options.settings,
-        stage=options.stage,
-        from_iter=options.from_iter,
-        engine=options.engine,
-        device=device,
-    )
+    asked = {name: getattr(options, name) for name in ("settings", "stage", "from_iter", "engine")}
+    words = rewritten(arguments, device=device, **asked)
     log.info("runs %s %s", script.stem, " ".join(words))
     plugins.register(recorder, "run")
     try:
@@ -92,12 +84,9 @@ def run(
             session.deactivate()
     learned = recorder.summary
     if learned is None:
-        raise HostFailed(
-            script.name,
-            "ended before the end of stage 2",
-            "a training that runs to its end",
-            "Read the host's own message above.",
-        )
+        found, expected = "ended before the end of stage 2", "a training that runs to its end"
+        raise HostFailed(script.name, found, expected, process.READ)
+    frame = "photographs and cameras in the host's own frame"
     return RunSummary(
         **vars(learned) | {"adapter": name},
         device=device,
@@ -105,10 +94,5 @@ def run(
         train_seconds=time.perf_counter() - started,
         curves=recorder.curves,
         output=output,
-        not_compared=NotComparedError(
-            name,
-            "photographs and cameras in the host's own frame",
-            "its own evaluation",
-            f"Run: {evaluation}",
-        ),
+        not_compared=NotComparedError(name, frame, "its own evaluation", f"Run: {evaluation}"),
     )

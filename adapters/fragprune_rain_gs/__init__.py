@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import fragprune_graphdeco as graphdeco
-from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
+from fragprune_graphdeco import SPLIT, GraphdecoAdapter, GraphdecoDialect, RasterizerCall, splits
 from fragprune_plugins.adapting import (
     HostCall,
     HostInfo,
@@ -31,8 +30,7 @@ if TYPE_CHECKING:
 PACKAGE = "submodules.diff_gaussian_rasterization.diff_gaussian_rasterization"
 """Inside the checkout, and compiled when it is imported."""
 
-WARM_UP = 10_000
-"""Iterations that ``--ours_new`` warms up."""
+WARM_UP = 10_000  # iterations that ``--ours_new`` warms up
 
 SMALLER = {
     **dict.fromkeys(("bicycle", "flowers", "garden", "stump", "treehill"), "images_4"),
@@ -59,7 +57,7 @@ def far_splits(call: SeamCall) -> Tensor:
     """The parents of a far split: N - 1 copies of each row, then N children."""
     children = call.arguments["N"]
     far = call.arguments["abe_split"]
-    return graphdeco.splits(call, copies=2 * children - 1 if far else children)
+    return splits(call, copies=2 * children - 1 if far else children)
 
 
 class RainGS(GraphdecoAdapter):
@@ -83,10 +81,7 @@ class RainGS(GraphdecoAdapter):
         GraphdecoAdapter.seams,
         {
             "GaussianRasterizer.forward": {"module": PACKAGE},
-            graphdeco.SPLIT.attribute: {
-                "needs": (*graphdeco.SPLIT.needs, "abe_split"),
-                "how": far_splits,
-            },
+            SPLIT.attribute: {"needs": (*SPLIT.needs, "abe_split"), "how": far_splits},
         },
     )
 

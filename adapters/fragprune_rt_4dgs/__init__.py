@@ -29,8 +29,7 @@ from fragprune_rt_4dgs.dialect import ARGUMENTS, OUTPUTS, RASTERIZER, SETTINGS, 
 if TYPE_CHECKING:
     from torch import Tensor
 
-ROTATIONS = "utils.general_utils"
-"""Where the host makes 4D rotations."""
+ROTATIONS = "utils.general_utils"  # where the host makes 4D rotations
 
 
 def with_its_map(call: SeamCall) -> Any:
@@ -63,12 +62,7 @@ class RT4DGS(GraphdecoAdapter):
     )
     package = RASTERIZER
     calls = (RasterizerCall(SETTINGS, OUTPUTS, arguments=ARGUMENTS),)
-    groups = (
-        *GraphdecoAdapter.groups,
-        ParamGroup("t"),
-        ParamGroup("scaling_t"),
-        ParamGroup("rotation_r"),
-    )
+    groups = (*GraphdecoAdapter.groups, *map(ParamGroup, ("t", "scaling_t", "rotation_r")))
     drawn_from = (
         *("get_current_covariance_and_mean_offset", "get_marginal_t"),
         *("active_sh_degree_t", "get_t", "time_duration"),
@@ -97,24 +91,15 @@ class RT4DGS(GraphdecoAdapter):
         },
     )
 
-    # -- its source ------------------------------------------------------------------------------
-
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
-        """Also that 4D rotations have their axes turned round, as the host does since late 2024.
-
-        What it drew before is another picture of the same numbers.
-        """
+        """Also that 4D rotations have their axes turned round, as the host does since late 2024."""
         texts = [text_of(repo.tree(each)) for each in (MODEL, ROTATIONS)]
         found = super().fingerprint(repo)
         if not any(map(re.compile(r"\bflip\([^()]*1, 2").search, texts)):
-            older, at = (
-                "4D rotations whose axes are not turned round",
-                (ROTATIONS, "build_rotation_4d"),
-            )
-            found.append(Finding.error("rotations", repo.place(*at), older, "flip(1, 2) of them"))
+            older = "4D rotations whose axes are not turned round"  # another picture of them
+            at = repo.place(ROTATIONS, "build_rotation_4d")
+            found.append(Finding.error("rotations", at, older, "flip(1, 2) of them"))
         return found
-
-    # -- its command line ------------------------------------------------------------------------
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
         """The same command, if the host can resume this configuration."""
@@ -126,15 +111,12 @@ class RT4DGS(GraphdecoAdapter):
             return script, arguments
         values = vars(flags) | YAMLFile("--config").read(flags.config)
         if values["gaussian_dim"] != 4:
-            raise UsageError(
-                "gaussian_dim",
-                f"{values['gaussian_dim']}: the host fails to resume its own checkpoints of these",
-                "4",
-                "Learn inside one run, with fragprune run --stage finetune --from-iter N.",
+            found = (
+                f"{values['gaussian_dim']}: the host fails to resume its own checkpoints of these"
             )
+            remedy = "Learn inside one run, with fragprune run --stage finetune --from-iter N."
+            raise UsageError("gaussian_dim", found, "4", remedy)
         return script, arguments
-
-    # -- its models ------------------------------------------------------------------------------
 
     def extra_parameters(self, model: Any) -> list[Tensor]:
         """The environment map, whose optimizer is a local of the training loop."""
@@ -148,8 +130,6 @@ class RT4DGS(GraphdecoAdapter):
         if saved is not None and model.env_map is not None and not model.env_map.any():
             with torch.no_grad():
                 model.env_map.copy_(saved)
-
-    # -- its files -------------------------------------------------------------------------------
 
     def model_file(self, output: Path, iteration: int) -> Path:
         """The path to which ``scene.save`` writes."""

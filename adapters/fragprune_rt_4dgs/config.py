@@ -10,10 +10,9 @@ from fragprune_plugins.adapting import ConfigFile
 
 
 class YAMLFile(ConfigFile):
-    """A YAML file. The host takes every value of every section, in order.
+    """A YAML file. The host takes every value of every section, in order: the last one wins.
 
-    The last value wins, so a section at the end overrules the file. The host's own reader is used,
-    because it accepts more number formats than YAML does.
+    The host's own reader is used, because it accepts more number formats than YAML does.
     """
 
     def read(self, path: Path) -> dict[str, Any]:

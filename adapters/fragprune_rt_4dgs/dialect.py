@@ -15,8 +15,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-RASTERIZER = "gaussian_renderer.diff_gaussian_rasterization"
-"""A file of the host, compiled when it is imported."""
+RASTERIZER = "gaussian_renderer.diff_gaussian_rasterization"  # compiled at its import
 
 SETTINGS = frozenset(
     ("sh_degree_t", "timestamp", "time_duration", "rot_4d", "gaussian_dim", "force_sh_3d")
@@ -63,10 +62,9 @@ class RT4DGSDialect(GraphdecoDialect):
         return super().unpack(HostCall(call.settings, flat))
 
     def rows_drawn(self, model: Any, call: HostCall) -> Tensor | None:
-        """Rows of a call: with ``compute_cov3D_python`` only those present at the moment.
+        """With ``compute_cov3D_python`` only rows present at the moment, by the host's own mask.
 
-        The host's own function gives the mask. The opacities of the call, which include the
-        marginal, must be those of these rows.
+        The opacities of the call, which include the marginal, must be those of these rows.
         """
         import torch
 
@@ -77,20 +75,17 @@ class RT4DGSDialect(GraphdecoDialect):
             rows: Tensor = (marginal[:, 0] > MARGINAL_MIN).nonzero()[:, 0]
             expected = (model.get_opacity * marginal)[rows]
         if not torch.equal(expected, call["opacities"]):
-            raise AlignmentError(
-                "rt-4dgs: compute_cov3D_python",
-                f"{len(call['opacities'])} Gaussians",
-                f"the {len(rows)} of {len(marginal)} that are present at "
-                f"{float(call.settings.timestamp):g}, with their opacities",
-                "Report this with the host's commit, or leave compute_cov3D_python off.",
-            )
+            where, found = "rt-4dgs: compute_cov3D_python", f"{len(call['opacities'])} Gaussians"
+            expected = f"the {len(rows)} of {len(marginal)} that are present at "
+            expected += f"{float(call.settings.timestamp):g}, with their opacities"
+            remedy = "Report this with the host's commit, or leave compute_cov3D_python off."
+            raise AlignmentError(where, found, expected, remedy)
         return rows
 
     def answer(
         self, call: HostCall, inputs: RasterInputs, draw: Callable[[RasterInputs], RasterOutputs]
     ) -> tuple[Tensor, ...]:
         """The result of ``pack``, and covs_com (P, 6): the drawn covariances, without gradients."""
-
         drawn = self.pack(draw(inputs), call)
         assert isinstance(inputs.splats, Splats)  # unpack made them
         assert inputs.splats.cov3d is not None

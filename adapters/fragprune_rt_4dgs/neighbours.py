@@ -16,17 +16,10 @@ def knnquery(
     indices: Tensor,
     distances: Tensor,
 ) -> None:
-    """Nearest points of each query among the points of its batch, nearest first.
+    """Nearest ``points`` (N, 3) of each of ``count`` ``queries`` (M, 3) in its own batch.
 
-    Args:
-        count: M, number of queries.
-        nearest: k, how many.
-        points: (N, 3).
-        queries: (M, 3).
-        offsets: (B,) where each batch of points ends.
-        query_offsets: (B,) where each batch of queries ends.
-        indices: (M, k) int32, filled with rows of ``points``.
-        distances: (M, k) filled with squared distances.
+    ``offsets`` (B,) say where batches end. Rows of points go to ``indices`` (M, nearest) int32,
+    squared distances to ``distances`` (M, nearest).
     """
     from scipy.spatial import cKDTree
 

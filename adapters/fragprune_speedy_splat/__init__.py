@@ -34,20 +34,14 @@ class SpeedySplatDialect(GraphdecoDialect):
     otherwise = "it draws beyond three sigma, and returns a time"
 
     def unpack(self, call: HostCall) -> RasterInputs:
-        """Translate the call as vanilla's; refuse a call that needs scores.
-
-        Raises:
-            EngineError: the host is about to prune; zeros as scores would prune every Gaussian.
-        """
+        """Translate the call; EngineError before pruning: scores of 0 would prune all."""
         scores = call.get("scores")
         if scores is not None and scores.requires_grad:
-            raise EngineError(
-                "the rasterizer's scores",
-                "a pruning pass of Speedy-Splat, which needs squared gradients per fragment",
-                "pictures only: our engines do not compute that score",
-                "Train with the host's own rasterizer and start from what it saved with "
-                f"--stage finetune; or give {UNTIL} 0 to train without pruning.",
-            )
+            found = "a pruning pass of Speedy-Splat, which needs squared gradients per fragment"
+            expected = "pictures only: our engines do not compute that score"
+            remedy = "Train with the host's own rasterizer and start from what it saved with "
+            remedy += f"--stage finetune; or give {UNTIL} 0 to train without pruning."
+            raise EngineError("the rasterizer's scores", found, expected, remedy)
         return super().unpack(call)
 
     def answer(

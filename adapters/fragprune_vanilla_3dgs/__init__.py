@@ -40,12 +40,8 @@ _EXPOSURES = UntrustedFile(
     "Remove it to begin with neutral exposures.",
 )
 
-OUTPUTS = 3
-"""Colour, radii and, since August 2024, inverse depth."""
-
-
-_KEPT = ".exposure.json"
-"""Exposures beside a PLY: those that it had before stage 2 wrote its own over them."""
+OUTPUTS = 3  # colour, radii and, since August 2024, inverse depth
+_KEPT = ".exposure.json"  # beside a PLY: what it had before stage 2 wrote its own
 
 
 def _kept(ply: Path) -> Path | None:
@@ -112,12 +108,10 @@ class Vanilla3DGS(GraphdecoAdapter):
         what = [f"{name}: {fork.unserved[name]}" for name in self.scripts if name in fork.unserved]
         what += [f"{name}, which changes the model" for name in fork.still if name not in known]
         what += [fork.one_run] if fork.one_run else []
-        steps = [
-            Finding.error("other-host", str(repo.root), each, "the steps of 3DGS alone")
-            for each in what
-        ]
+        about, steps = ("other-host", str(repo.root)), "the steps of 3DGS alone"
         found = ForkAdapter().fingerprint(repo)  # groups were checked: here they need no names
-        return [*(each for each in found if each.code != "param-groups"), *steps]
+        served = [each for each in found if each.code != "param-groups"]
+        return served + [Finding.error(*about, each, steps) for each in what]
 
     def _state(self, repo: HostRepo) -> Finding:
         """A finding that names the revision; an error if it has no checkpoints."""
@@ -125,13 +119,11 @@ class Vanilla3DGS(GraphdecoAdapter):
         there = [name for name in names if repo.function(graphdeco.MODEL, f"GaussianModel.{name}")]
         if there != ["training_setup"]:
             return Finding("info", "revision", str(repo.root), self.revision(repo))
-        return Finding.error(
-            "revision",
-            repo.place(graphdeco.MODEL, "GaussianModel"),
-            "neither capture nor restore, as vanilla 3DGS was until 14 July 2023",
-            "checkpoints, which stage 2 resumes",
-            "Bring the fork to a later state, or give its PLY to fragprune finetune.",
-        )
+        at = repo.place(graphdeco.MODEL, "GaussianModel")
+        found = "neither capture nor restore, as vanilla 3DGS was until 14 July 2023"
+        remedy = "Bring the fork to a later state, or give its PLY to fragprune finetune."
+        expected = "checkpoints, which stage 2 resumes"
+        return Finding.error("revision", at, found, expected, remedy)
 
     def revision(self, repo: HostRepo) -> str:
         """The public state of the source."""

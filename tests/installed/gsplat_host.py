@@ -10,13 +10,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from fragprune_gsplat import GROUPS
+from fragprune_gsplat import KEYS, NAMES
 from fragprune_plugins.adapting import HostRepo, read_ply
 from fragprune_plugins.injection.session import active_session
 from fragprune_plugins.testing import Chance, Host
 from fragprune_plugins.testing.host import FAINT, Action
-
-KEYS = tuple(GROUPS)
 
 
 def releases() -> dict[str, Path]:
@@ -158,7 +156,7 @@ class GsplatHost(Host):
         """gsplat reads no files: users do, and take thresholds up through the session."""
         if axes():
             ply = read_ply(path)
-            saved = {key: getattr(ply, name) for key, name in GROUPS.items()}
+            saved = {key: getattr(ply, name) for key, name in NAMES.items()}
         else:
             saved = torch.load(path)
         for key in KEYS:
