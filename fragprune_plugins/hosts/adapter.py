@@ -22,18 +22,11 @@ from fragprune_plugins.hosts.source import HostRepo, look_up
 if TYPE_CHECKING:
     from torch import Tensor
 
-CHECKPOINT_KEY = "fragprune"
-"""Under which a host's checkpoint carries thresholds, in the state of the optimizer."""
+CHECKPOINT_KEY = "fragprune"  # of thresholds, in the optimizer's state of a checkpoint
 
 
 def optimizer_state(capture: Any, where: str) -> dict[str, Any]:
-    """The first optimizer's state dict in a host's checkpoint.
-
-    It can hold a key of ours, because ``load_state_dict`` ignores keys that it does not know.
-
-    Raises:
-        ModelFileError: there is none.
-    """
+    """The first optimizer's state in a checkpoint, which keeps keys of ours, or ModelFileError."""
     for part in capture:
         if isinstance(part, dict) and "param_groups" in part:
             return part
@@ -109,12 +102,7 @@ class ConfigFile:
 
 
 def read_config(config: ConfigFile, path: Path) -> dict[str, Any]:
-    """The values of a configuration file by argument name.
-
-    Raises:
-        HostNeedsError: the package is missing with which the host reads it.
-        UsageError: the file cannot be read.
-    """
+    """Values of a configuration file by argument name, or HostNeedsError or UsageError."""
     remedy, expected = f"Correct {config.flag} {path}.", "a file the host can read"
     kind = UntrustedFile(UsageError, "unreadable", expected, remedy, limit=MEBIBYTE, missing=remedy)
     with kind.reading(path):
@@ -192,12 +180,9 @@ class CommandLine:
         return (flags,) if isinstance(flags, str) else flags
 
     def read(self, arguments: list[str]) -> argparse.Namespace:
-        """The values of the flags above by field, as the host will read them.
+        """The values of the flags above by field, as the host reads them, or UsageError.
 
         A flag that the command lacks gives None, or False if it takes no value.
-
-        Raises:
-            UsageError: a flag lacks its value, or the configuration file cannot be read.
         """
         options: dict[str, dict[str, Any]] = {
             "resolution": {"type": int},
@@ -216,10 +201,7 @@ class CommandLine:
     def parsed(
         self, arguments: list[str], flags: Mapping[str, tuple[Sequence[str], dict[str, Any]]]
     ) -> dict[str, Any]:
-        """Values of flags by name, as the host reads them, and "config".
-
-        What that file says goes before the command; UsageError as of ``read``.
-        """
+        """Values of flags by name, as the host reads them, and "config", whose file wins."""
         parser = Flags(add_help=False, allow_abbrev=False, conflict_handler="resolve")
         for name, (spellings, more) in flags.items():
             if spellings:
@@ -262,8 +244,6 @@ class HostAdapter(ABC):
     groups: tuple[ParamGroup, ...] = GROUPS
     on_gpu: bool = True
 
-    # -- the source ------------------------------------------------------------------------------
-
     def seams_for(self, repo: HostRepo) -> tuple[Seam, ...]:
         """The seams of this revision; by default all of ``seams``."""
         return self.seams
@@ -271,7 +251,7 @@ class HostAdapter(ABC):
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
         """Findings on whether the source is this host; an error finding means that it is not.
 
-        By default it is where it is an installed package of this host.
+        By default it is if it is an installed package of this host.
         """
         if repo.package in self.installed:
             return [Finding("info", "revision", repo.package, repo.commit)]
@@ -285,13 +265,10 @@ class HostAdapter(ABC):
             seams = [look_up(repo, seam) for seam in self.seams_for(repo)]
             findings = [*self.fingerprint(repo), *(each.finding for each in seams if each.finding)]
         except Exception as error:  # the adapter's own; others are still tried
-            failed = Finding.error(
-                "adapter-failed",
-                f"adapter {self.name}",
-                f"{type(error).__name__}: {error}",
-                "an adapter that reads any folder",
-                "Report it to the adapter's author.",
-            )
+            found = f"{type(error).__name__}: {error}"
+            where, expected = f"adapter {self.name}", "an adapter that reads any folder"
+            remedy = "Report it to the adapter's author."
+            failed = Finding.error("adapter-failed", where, found, expected, remedy)
             return Match(self.name, False, (failed,))
         fits = not any(finding.level == "error" for finding in findings)
         return Match(self.name, fits, tuple(findings), tuple(seams))
@@ -304,14 +281,10 @@ class HostAdapter(ABC):
         """What runs a training script of this host under ``fragprune run``; None if nothing does.
 
         A ``ScriptAdapter``, or a function that runs the command itself: it gets the script, its
-        arguments, the module's name and the ``RunOptions``, and returns a ``RunSummary``.
-
-        Args:
-            script: the file, which may be outside the host and import it.
+        arguments, the module's name and the ``RunOptions``, and returns a ``RunSummary``. A script
+        may be outside the host and import it.
         """
         return None
-
-    # -- its models ------------------------------------------------------------------------------
 
     @abstractmethod
     def means(self, model: Any) -> Tensor:
@@ -326,12 +299,10 @@ class HostAdapter(ABC):
         return id(camera)
 
     def model_of(self, call: SeamCall) -> Any:
-        """The model of a seam's call: by default the object of the method.
+        """The model of a seam's call, or its means' tensor; by default the object of the method.
 
-        Override this for hosts with trainers or functions that change models.
-
-        The tensor of the means is enough if a call has nothing else; None if the call concerns no
-        model of ours.
+        Override this for hosts with trainers or functions that change models. None if the call
+        concerns no model of ours.
         """
         return call.instance
 
@@ -380,9 +351,7 @@ class ScriptAdapter(HostAdapter):
     def lengthened(self, arguments: list[str], first: int, last: int) -> list[str]:
         """Arguments of a host that cannot resume (``CommandLine.one_run``) for a longer training.
 
-        Args:
-            first: the iteration at which its training would end, and at which it also saves.
-            last: the iteration at which stage 2 ends.
+        It also saves at iteration ``first``, its own end, and stage 2 ends at ``last``.
         """
         raise NotImplementedError(f"{self.name}: one_run needs lengthened()")
 
@@ -390,10 +359,9 @@ class ScriptAdapter(HostAdapter):
         """Raise UsageError unless the host can resume from this file and count on from it."""
 
     def densified(self, repo: HostRepo, script: Path, arguments: list[str]) -> int | None:
-        """The iteration of a training command after which densification is over.
+        """The iteration after which a training adds, relocates, prunes and resets no Gaussian.
 
-        The host adds, relocates, prunes and resets no Gaussian after it. ``--stage joint`` learns
-        from there by default. None if the host's arguments do not tell, or if it never stops.
+        ``--stage joint`` learns from there by default. None if arguments do not tell, or if never.
         """
         return None
 
@@ -403,18 +371,11 @@ class ScriptAdapter(HostAdapter):
         Raises:
             NotComparedError: our readers would read the images differently.
         """
-        raise NotComparedError(
-            self.name,
-            "photographs that only the host can read",
-            "an adapter with photographs()",
-            "Define photographs() in the adapter.",
-        )
+        found, expected = "photographs that only the host can read", "an adapter with photographs()"
+        raise NotComparedError(self.name, found, expected, "Define photographs() in the adapter.")
 
     def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any]:
-        """How to draw the finished model of a training command, where vanilla's rules do not apply.
-
-        Returns:
-            Fields of ``RasterInputs``.
+        """Fields of ``RasterInputs`` for a training's model, where vanilla's rules do not apply.
 
         Raises:
             NotComparedError: our engines would draw the model differently from the host.
@@ -433,21 +394,11 @@ class ScriptAdapter(HostAdapter):
         """The file to which the host saves its model at an iteration."""
 
     def saved_iterations(self, output: Path) -> list[tuple[int, Path]]:
-        """Files of an output folder to resume from: (iteration, checkpoint or PLY), newest last.
-
-        By default none, because the host cannot resume.
-        """
+        """(iteration, checkpoint or PLY) to resume from in an output folder, newest last."""
         return []
 
     def checkpoint_from_ply(self, ply: Path, iteration: int, target: Path) -> None:
-        """Make a checkpoint from a PLY of the host, from which the host can resume.
-
-        Raises:
-            UsageError: the host cannot resume from one.
-        """
-        raise UsageError(
-            str(ply),
-            f"a PLY, from which {self.info.title} cannot resume",
-            "a checkpoint of its own training",
-            "Name one with its flag for that, or prune the PLY: fragprune finetune.",
-        )
+        """Make a checkpoint to resume from a PLY of the host; UsageError if the host cannot."""
+        found = f"a PLY, from which {self.info.title} cannot resume"
+        remedy = "Name one with its flag for that, or prune the PLY: fragprune finetune."
+        raise UsageError(str(ply), found, "a checkpoint of its own training", remedy)

@@ -14,7 +14,7 @@ from fragprune_plugins.hosts.source import HostRepo
 def attempt(repo: HostRepo, adapters: Sequence[HostAdapter]) -> dict[HostAdapter, Match]:
     """Try each adapter on a codebase; the best fit comes first.
 
-    That is by the share of seams that hold, then by the kinds and by the size of the errors.
+    By the share of seams that hold, then by the kinds and by the size of the errors.
     """
 
     def order(tried: tuple[HostAdapter, Match]) -> tuple[bool, float, int, int]:
@@ -36,9 +36,8 @@ def locate(
 ) -> tuple[HostRepo, HostAdapter]:
     """Find the checkout that is a script's folder or contains it, and its adapter; see ``choose``.
 
-    If no adapter finds a seam in it, but its scripts import an installed host, or ``name`` is the
-    adapter of an installed host, the result is the installed package. With ``above`` the folder
-    that contains this one is looked at, too, if scripts here import what lies in it.
+    If no adapter finds a seam in it, it is an installed package that scripts import, or that of the
+    adapter ``name``. With ``above`` the folder above counts, if scripts import from it.
     """
     try:
         return repo, choose(repo, adapters, name, select)
@@ -61,7 +60,7 @@ def locate(
 
 
 def folder_above(repo: HostRepo) -> list[HostRepo]:
-    """The folder above, which may hold all that its user has, if scripts import what lies in it."""
+    """The folder above, if scripts import what lies in it."""
     above = HostRepo(repo.root.parent)
     return [above] if any(map(above.path, repo.imported)) else []
 
@@ -74,10 +73,7 @@ def choose(
 ) -> HostAdapter:
     """Choose the adapter for a checkout: the named one, or the only one that fits.
 
-    If the adapters of a host and of its ancestor both fit, the host's is chosen (``closest``).
-
-    Args:
-        select: breaks a tie; the hook ``fragprune_select_adapter``.
+    If those of a host and of its ancestor fit, the host's is chosen. ``select`` breaks a tie.
 
     Raises:
         UnknownHostError: no adapter fits, the named one does not fit, or several fit.

@@ -102,11 +102,7 @@ class Prover(ABC):
 
     @abstractmethod
     def prove(self, call: SeamCall, drawn: HostCall, place: Place) -> Proof:
-        """Draw a call both ways and compare every output and every gradient.
-
-        Args:
-            drawn: the same as data, with the engine.
-        """
+        """Draw a call both ways, ``drawn`` with the engine; compare every output and gradient."""
 
     @abstractmethod
     def answer(

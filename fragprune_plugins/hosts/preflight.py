@@ -48,7 +48,7 @@ class Missing:
 
 
 def install(missing: Collection[Missing]) -> str:
-    """What to do to get them: pip's command for those that it has, and where to read of others."""
+    """How to get them: pip's command for those that it has, and where to read of others."""
     by_pip = [each.distribution for each in missing if each.distribution]
     others = [each.module for each in missing if not each.distribution]
     ways = [f"Run: pip install {' '.join(by_pip)}"] if by_pip else []
@@ -62,9 +62,8 @@ def missing_imports(
 ) -> list[Missing]:
     """Packages that a host's scripts import at their start and that are not installed.
 
-    This follows the imports at the top of the scripts and of the host's own modules that these
-    import. It ignores imports inside ``try``, a condition or a function, and the dotted names for
-    which stand-ins are ``provided``.
+    It follows imports at the top of scripts and of the host's own modules, none inside ``try``, a
+    condition or a function, and leaves out dotted names for which stand-ins are ``provided``.
     """
     found: dict[str, Missing] = {}
     for script in scripts:

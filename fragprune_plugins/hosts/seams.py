@@ -1,7 +1,6 @@
 """Seams: the functions of a host that we wrap, as data.
 
-As data, seams can be printed, checked against the source without an import, tested in every order
-and undone.
+Data can be printed, checked against the source without an import, tested in every order and undone.
 """
 
 from __future__ import annotations
@@ -169,11 +168,7 @@ class SeamCall:
         return self.arguments[self.seam.needs[0]]
 
     def run(self, **changed: Any) -> Any:
-        """Call the host's function.
-
-        Args:
-            changed: arguments by name, in place of the host's.
-        """
+        """Call the host's function, with some arguments ``changed``, by name."""
         if changed:
             bound = self._signature.bind(*self.args, **self.kwargs)
             bound.arguments.update(changed)
@@ -209,10 +204,8 @@ def revised(
     """Change an ancestor's table of seams for a descendant.
 
     Args:
-        changes: new field values of a seam, by its attribute; None removes the seam.
-
-    Raises:
-        ValueError: a changed seam is not in the table.
+        changes: new field values of a seam, by its attribute; None removes the seam. ValueError if
+            there is no such seam.
     """
     table = tuple(seams)
     if missing := changes.keys() - {seam.attribute for seam in table}:

@@ -111,10 +111,7 @@ class HostRepo:
         return self._paths[module]
 
     def _inside(self, path: Path) -> bool:
-        """Whether a path of a checkout stays in it once its links are followed.
-
-        Package managers install packages as links, so installed ones may lead anywhere.
-        """
+        """Whether a path stays in its checkout. Package managers install packages as links."""
         return bool(self.package) or lies_in(path, self.root)
 
     def read(self, path: Path) -> str:
@@ -195,7 +192,7 @@ class HostRepo:
 
     @cached_property
     def commit(self) -> str:
-        """The checkout's commit, read from .git without running git; "" when there is none.
+        """The checkout's commit, read from .git, or "".
 
         An installed package has the distributions in its folder and their versions instead.
         """
