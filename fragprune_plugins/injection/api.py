@@ -65,11 +65,7 @@ def activate(
 
 
 def deactivate() -> list[Finding]:
-    """Restore every original of the host; does nothing if no session is active.
-
-    Returns:
-        A finding for each function that could not be restored.
-    """
+    """Restore every original of the host; gives a finding for each that cannot be restored."""
     active = _session.active_session()
     return active.deactivate() if active else []
 

@@ -12,8 +12,7 @@ from fragprune_plugins.errors import UsageError, log
 from fragprune_plugins.hosts.adapter import CommandLine, ConfigFile, read_config
 from fragprune_plugins.hosts.source import HostRepo
 
-_OPTION = re.compile("-[bBdEiIOPqsSuvx]+|-[WX].*")
-"""Options of the interpreter. Those that name what to run are not among them: ``-c`` and ``-m``."""
+_OPTION = re.compile("-[bBdEiIOPqsSuvx]+|-[WX].*")  # not -c and -m, which name what runs
 
 
 @dataclass
@@ -60,12 +59,7 @@ class HostCommand:
         return sorted({*(self.flags.save_checkpoints or []), last})
 
     def saving(self, scratch: Path, last: int, **extra: Any) -> list[str]:
-        """Arguments with flags appended, so that the host also saves its model at ``last``.
-
-        Args:
-            scratch: folder for a copy of the host's configuration file.
-            extra: values by field of ``CommandLine``.
-        """
+        """``with_flags``, and flags by which the host also saves its model at ``last``."""
         if self.line.checkpoints_only:
             extra["save_checkpoints"] = self.checkpoints(last)
         if self.line.config and self.flags.config:
@@ -73,14 +67,10 @@ class HostCommand:
         return self.with_flags(scratch, **extra) if extra else self.arguments
 
     def with_flags(self, scratch: Path, **extra: Any) -> list[str]:
-        """Arguments with flags appended; argparse takes the last value of a flag.
+        """Arguments with flags of these fields appended; argparse takes the last value of a flag.
 
-        A host's configuration file overrides flags, so a changed copy replaces it. The flags are
-        appended as well, since a host may read the iterations to save at before it reads the file.
-
-        Args:
-            scratch: folder for that copy.
-            extra: values by field of ``CommandLine``.
+        A host's configuration file overrides flags, so a changed copy in ``scratch`` replaces it.
+        A host may read the iterations to save at before it reads the file.
         """
         given = {self.line.spellings(name)[-1]: value for name, value in extra.items()}
         out = list(self.arguments)
@@ -95,10 +85,7 @@ class HostCommand:
 
 
 def split(command: list[str], *, quietly: bool = False) -> tuple[Path, list[str], str]:
-    """(script, arguments, module) of a command; a leading interpreter is dropped.
-
-    ``module`` is "" unless the command is ``python -m module``.
-    """
+    """(script, arguments, module) of a command; ``module`` is "" but of ``python -m module``."""
     words = list(command)
     if words and Path(words[0]).name.startswith("python"):
         words = _without_options(words[1:], quietly=quietly)

@@ -60,29 +60,16 @@ class RunOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class RunSummary(Summary):
-    """The result of a run; without a step where nothing learned.
-
-    Attributes:
-        model_before: the host's PLY of stage 1, if there is one.
-        model_after: the host's PLY after stage 2; its sidecar lies beside it.
-        curves: one dict per learned step: step, loss, fragments_per_pixel, pressure,
-            threshold_median.
-        output: the host's output folder; stage 1's, if stage 2 has its own.
-        photographs: the data set whose held-out views, if any, can measure the models; None if
-            they cannot be measured.
-        drawing: fields of ``RasterInputs`` with which the host draws its models.
-        not_compared: the reason why learned models cannot be compared; otherwise None.
-        already_finished: ``model_after`` was there before, and nothing was run.
-    """
+    """The result of a run; without a step where nothing learned."""
 
     device: str
     stage: str
-    model_before: Path | None = None
-    model_after: Path | None = None
+    model_before: Path | None = None  # the host's PLY of stage 1, if there is one
+    model_after: Path | None = None  # that after stage 2; its sidecar lies beside it
     train_seconds: float
-    curves: list[dict[str, float]]
-    output: Path | None = None
-    photographs: Photographs | None = None
-    drawing: dict[str, Any] = field(default_factory=dict)
-    not_compared: NotComparedError | None = None
-    already_finished: bool = False
+    curves: list[dict[str, float]]  # ``StepStats`` of each learned step
+    output: Path | None = None  # the host's folder; stage 1's, if stage 2 has its own
+    photographs: Photographs | None = None  # whose held-out views, if any, measure the models
+    drawing: dict[str, Any] = field(default_factory=dict)  # fields of the host's ``RasterInputs``
+    not_compared: NotComparedError | None = None  # the reason, if learned models cannot be
+    already_finished: bool = False  # ``model_after`` was there before, and nothing was run

@@ -1,8 +1,7 @@
 """The patch ledger wraps seams when their modules are imported, and restores them.
 
-wrapt wraps and unwraps. The ledger adds checks for hosts: it checks a signature before the function
-runs, refuses a host that was imported too early, and reports wrappers that cannot be removed. Such
-a wrapper stays, and only calls the original.
+wrapt wraps and unwraps. The ledger also checks signatures and refuses a host that was imported too
+early. A wrapper that cannot be removed is reported; it stays, and only calls the original.
 """
 
 from __future__ import annotations
@@ -40,15 +39,11 @@ class PatchLedger:
         self._waiting: list[list[Callable[[ModuleType], None]]] = []
 
     def wrap(self, seam: Seam, wrapper: Wrapper) -> None:
-        """Wrap a seam now if its module is imported, else as soon as the module is imported.
-
-        Args:
-            wrapper: ``wrapper(wrapped, instance, args, kwargs)``, as wrapt calls it.
+        """Wrap a seam now, or as soon as its module is imported, by ``wrapper`` as wrapt calls it.
 
         Raises:
             LateImportError: the module is imported, and other modules hold the function by name.
-            SeamError: the function is missing or lacks a parameter. If the module is imported
-                later, the host's ``import`` raises it.
+            SeamError: the function is missing or lacks a parameter. A later import may raise it.
         """
 
         def standing_aside(wrapped: Any, instance: Any, args: Any, kwargs: Any) -> Any:
@@ -73,11 +68,7 @@ class PatchLedger:
         wrapt.register_post_import_hook(lambda found: [do(found) for do in waiting], seam.module)
 
     def undo(self) -> list[Finding]:
-        """Restore every original, newest first.
-
-        Returns:
-            A finding for each wrapper that could not be removed.
-        """
+        """Restore every original, newest first; gives a finding for each wrapper that stays."""
         self._live = False
         for waiting in self._waiting:
             waiting.clear()
@@ -90,9 +81,8 @@ class PatchLedger:
                 for other in _holding(seam.attribute, handle).values():
                     setattr(other, seam.attribute, getattr(module, seam.attribute))
             except (wrapt.WrapperNotOutermostError, wrapt.WrapperNotFoundError) as error:
-                expected = "fragprune's wrapper outermost"
                 remedy = "The wrapper stays, and only calls the original."
-                said = str(seam), str(error), expected, remedy
+                said = str(seam), str(error), "fragprune's wrapper outermost", remedy
                 findings.append(Finding("warning", "not-undone", *said))
         return findings
 
@@ -120,8 +110,7 @@ class PatchLedger:
     def _refuse_late(self, module: ModuleType, seam: Seam) -> None:
         """Refuse if a module holds a copy by ``from module import name``, which stays unpatched.
 
-        For a function outside the host (``seam.external``), only copies in the host's modules
-        count.
+        Of a function outside the host (``seam.external``) only the host's modules count.
         """
         name = seam.attribute
         original = getattr(module, name, None)

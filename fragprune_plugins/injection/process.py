@@ -62,11 +62,7 @@ def telling(script: Path, root: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def host_process(script: Path, arguments: list[str], device: str, folder: Path) -> Iterator[None]:
-    """Inside, ``sys.argv``, ``sys.path`` and devices are set for the script; then restored.
-
-    Args:
-        folder: the first folder of the module search path.
-    """
+    """Inside, ``sys.argv``, ``sys.path`` (first ``folder``) and devices are set for the script."""
     saved = sys.argv, sys.path[:], sys.stdout, sys.stderr
     sys.argv = [str(script), *arguments]
     sys.path.insert(0, str(folder))
@@ -92,13 +88,10 @@ def surroundings(device: str) -> Iterator[None]:
 
 
 def run_main(script: Path, module: str) -> None:
-    """Run a script as ``__main__``; returns when it ends, also by ``sys.exit(0)``.
-
-    Args:
-        module: the module's name, if the script runs as ``python -m module``; else "".
+    """Run a script, or ``python -m module``, as ``__main__``, to its end or ``sys.exit(0)``.
 
     Raises:
-        HostFailed: the script ended with another exit code.
+        HostFailed: it ended with another exit code.
         FragpruneError: it did so because of this error of ours.
     """
     try:
@@ -121,8 +114,7 @@ def forget_modules(root: Path, known: set[str], packages: tuple[str, ...] = ()) 
     """Drop the host's own modules, so that its script can run again from the start.
 
     Args:
-        root: the host's folder, itself perhaps part of an environment. Packages of an environment
-            that is this folder, or inside it, are kept.
+        root: the host's folder; packages of an environment that is this folder, or in it, are kept.
         known: names of modules that were imported before the host ran.
         packages: import names of an installed host; its compiled modules are kept.
     """
@@ -137,11 +129,7 @@ def forget_modules(root: Path, known: set[str], packages: tuple[str, ...] = ()) 
 
 
 def host_device(wanted: str, engine: str) -> str:
-    """The host's device, "cpu", "cuda" or "cuda:N"; "auto" takes a GPU if torch sees one.
-
-    Raises:
-        UsageError: the device does not exist.
-    """
+    """The host's device, "cpu", "cuda" or "cuda:N"; "auto" takes a GPU if torch sees one."""
     if wanted == "auto" and torch.cuda.is_available():
         return "cuda"
     return str(device_for(wanted, engine))
@@ -178,10 +166,7 @@ def _refuse_to_start_again(program: str, arguments: list[str]) -> NoReturn:
 
 @contextlib.contextmanager
 def _host_pictures() -> Iterator[None]:
-    """Inside, Pillow accepts int8 arrays, as earlier versions did.
-
-    Hosts that read Blender scenes pass them.
-    """
+    """Inside, Pillow takes int8 arrays, as it once did: hosts with Blender scenes pass them."""
     fromarray = Image.fromarray
 
     def from_bytes(array: Any, mode: str | None = None) -> Any:

@@ -36,10 +36,7 @@ def proved(
 ) -> Proof | None:
     """The proof of a call of the host's own rasterizer, made now if there is none yet.
 
-    None where it failed and may fail, and where our engines do not draw such a call.
-
-    Args:
-        strict: False warns where the proof fails.
+    None where it failed and may fail (not ``strict``), and where our engines draw no such call.
 
     Raises:
         ProofError: it draws otherwise, or returns something that the host uses and we do not know.

@@ -13,11 +13,7 @@ _LAUNCHERS = {"torchrun", "torch.distributed.run", "torch.distributed.launch", "
 
 
 def expect_one() -> None:
-    """Check that this process trains alone.
-
-    The store of thresholds would learn from one rank's views only, and each rank would write its
-    own sidecar.
-    """
+    """Check that this process trains alone: a store would learn from the views of one rank only."""
     said = os.environ.get("WORLD_SIZE", "")
     ranks, found = int(said) if said.isdigit() else 1, f"WORLD_SIZE={said} in the environment"
     if torch.distributed.is_available() and torch.distributed.is_initialized():

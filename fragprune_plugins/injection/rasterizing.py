@@ -176,10 +176,7 @@ def covering(thresholds: Tensor | None, inputs: RasterInputs) -> Tensor | None:
 
 
 def further_picture(state: ModelState, picture: tuple[Hashable, int]) -> bool:
-    """Whether this was drawn before in this step: a host may also draw depth or normals of a view.
-
-    The first picture bears the pressure, and its fragments count.
-    """
+    """Whether this was drawn before in this step: only a step's first picture bears pressure."""
     if not torch.is_grad_enabled():
         return False
     drawn, state.pictured[picture] = state.pictured.get(picture), state.steps
@@ -191,7 +188,7 @@ def proved_answer(
 ) -> Callable[..., Any]:
     """What answers a call, once the host's own rasterizer is proved, if it needs and can be.
 
-    A later call of a stage in which nothing of ours draws may fail: stage 2 would refuse it.
+    Where nothing of ours draws, a later call of a stage may fail: stage 2 would refuse it.
     """
     ours, prover = state is not None and state.store.cuts, session.dialect.prover
     if not session.prove and not ours:
@@ -306,10 +303,7 @@ class Unmeasured(torch.nn.Module):
 
 
 def on_metric(session: SessionState, call: SeamCall) -> Any:
-    """Let a metric be NaN if its weights cannot be loaded, so that the run goes on.
-
-    The seam is a function, or a class whose objects measure.
-    """
+    """Let a metric, a function or a class, be NaN if its weights cannot be loaded."""
     if call.seam not in session.absent:
         try:
             return call.run()

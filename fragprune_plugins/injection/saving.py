@@ -21,10 +21,7 @@ from fragprune_plugins.learning.thresholds import ThresholdStore
 
 
 def on_save(session: SessionState, call: SeamCall) -> Any:
-    """Have the host write its file aside, then put file and sidecar in place, both at once.
-
-    Values that are not finite stop both. Without thresholds an earlier file's sidecar goes.
-    """
+    """Have the host write its file aside, then put file and sidecar in place, both at once."""
     model, state = learner(session, call)
     if state is None or call.first is None:
         result = call.run()
@@ -103,13 +100,10 @@ def on_unpack(session: SessionState, call: SeamCall) -> Any:
 
 
 def attach_file(session: SessionState, model: Any, expected: Tensor, store: ThresholdStore) -> None:
-    """Attach the thresholds of an unpacked file to the model that the host draws next.
+    """Attach thresholds of an unpacked file, of means ``expected`` (N, 3), to the model drawn next.
 
-    A model that has thresholds already takes these if it has the file's Gaussians: the host
-    resumes it. If not, they wait for another model.
-
-    Args:
-        expected: (N, 3) means of the unpacked file.
+    A model that has thresholds takes these if it has the file's Gaussians: the host resumes it.
+    If not, they wait for another model.
     """
     means, known = session.adapter.means(model), session.models.get(model)
     parts = slice(1), slice(None)  # the first row tells most others apart
@@ -127,10 +121,7 @@ def attach_file(session: SessionState, model: Any, expected: Tensor, store: Thre
 
 
 def on_capture(session: SessionState, call: SeamCall) -> Any:
-    """Put thresholds into the host's checkpoint.
-
-    Neutral thresholds go in too in stage 2: they mark the checkpoint as one of stage 2.
-    """
+    """Put thresholds into the host's checkpoint; in stage 2 neutral ones too, as its mark."""
     model, state = learner(session, call)
     result, session.held = call.run(), None
     if state is not None and (session.standing_still(model) or state.store.cuts):
@@ -159,7 +150,7 @@ def on_restore(session: SessionState, call: SeamCall) -> Any:
 def brought(capture: Any, device: torch.device) -> Any:
     """What a checkpoint holds, on its model's GPU, if none of it is there: ours are on the CPU.
 
-    Hosts load one to where it was saved. Scalars stay: Adam counts its steps on the CPU.
+    Scalars stay: Adam counts its steps on the CPU.
     """
     if device.type == "cpu" or any(each.device == device for each in tensors_of(capture)):
         return capture
@@ -187,10 +178,7 @@ def changed(held: Any, change: Callable[[Any], Any]) -> Any:
 
 
 def restore_rates(session: SessionState, model: Any) -> None:
-    """Give groups the learning rates that the host set up, if a checkpoint has none.
-
-    A checkpoint made from a PLY has none.
-    """
+    """Give groups the rates that the host set up, if the checkpoint, made from a PLY, has none."""
     groups = [(name, group) for name, group in session.groups(model) if name]
     if not any(group["lr"] for _, group in groups):
         for name, group in groups:

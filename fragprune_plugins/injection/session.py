@@ -70,9 +70,7 @@ class Session(SessionState):
         return StandIns(self.dialect, partial(rasterizing.draw, self), self.drop_in)
 
     def activate(self) -> Session:
-        """Wrap every seam. Call it before the host's imports.
-
-        If it raises, nothing stays patched.
+        """Wrap every seam. Call it before the host's imports; if it raises, nothing stays patched.
 
         Raises:
             SessionError: another session is active.
@@ -107,11 +105,7 @@ class Session(SessionState):
         return self
 
     def deactivate(self) -> list[Finding]:
-        """Restore every original; does nothing if the session is inactive.
-
-        Returns:
-            A finding for each function that could not be restored.
-        """
+        """Restore every original, if active; a finding for each that could not be restored."""
         global _active
         if _active is self:
             _active = None
@@ -175,10 +169,7 @@ class Session(SessionState):
             raise SessionError(self.adapter.name, found, "one view or more in every step", remedy)
 
     def save_learned(self, iteration: int = 0) -> Path | None:
-        """Save the model with the host's own function, and the sidecar beside it.
-
-        As that of an ``iteration``, or after Ctrl-C of the last step; None if nothing is to save.
-        """
+        """Have the host save the model, as of an iteration, or of its last step if it learned."""
         model = self.last() if self.last else None
         if model is None or self.output is None or not isinstance(self.adapter, ScriptAdapter):
             return None

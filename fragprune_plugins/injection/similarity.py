@@ -15,8 +15,7 @@ from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
 from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.state import SessionState
 
-TOLERANCE = 1e-3
-"""How far apart the two may be: values, and gradients as a share of the largest."""
+TOLERANCE = 1e-3  # how far apart the two may be: values, and gradients as a share of the largest
 
 
 def seam_of(repo: HostRepo) -> Seam | None:
@@ -44,10 +43,7 @@ def on_similarity(session: SessionState, call: SeamCall) -> Any:
 
 
 def images(call: SeamCall) -> tuple[Tensor, Tensor] | None:
-    """The images of a call that compiled code can answer, (C, H, W) or (1, C, H, W).
-
-    The constant one comes last.
-    """
+    """The images of a call for compiled code, (C, H, W) or (1, C, H, W), the constant one last."""
     if len(call.args) + len(call.kwargs) != 2:  # another window, or a value for each image
         return None
     pair = [call.arguments[name] for name in call.seam.needs]
@@ -69,10 +65,7 @@ def similarity(image: Tensor, target: Tensor) -> Tensor:
 
 @torch.enable_grad()
 def agrees_on_a_probe(function: Callable[..., Any], shape: torch.Size) -> bool:
-    """Whether a host's function gives the same value and gradient, but for rounding.
-
-    The probe is two small images, from dark, where the constants count, to bright.
-    """
+    """Whether a host's function gives the same value and gradient on two images, dark to bright."""
     stream, light = torch.Generator().manual_seed(0), torch.logspace(-2.5, 0, 40)
     image, target = (torch.rand(*shape[:-2], 24, 40, generator=stream) * light for _ in range(2))
     image.requires_grad_()

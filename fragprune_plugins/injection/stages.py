@@ -1,8 +1,7 @@
 """The stages of a run.
 
-A training run has two stages. Stage 1 is the host's own training; fragprune only adds the flag that
-saves a checkpoint at the end. Stage 2 runs the host's script again. It resumes from that checkpoint
-for more iterations, and thresholds learn.
+Stage 1 is the host's own training; fragprune only adds the flag that saves a checkpoint at its end.
+Stage 2 runs the host's script again, from that checkpoint for more iterations: thresholds learn.
 """
 
 from __future__ import annotations
@@ -171,10 +170,7 @@ class Stages:
             self._learn(total, arguments, settings=self.settings, start=first, origin=start.path)
 
     def _apart(self, own: str = "") -> dict[str, str]:
-        """Save what learns in this folder in the output folder, a control always in one of its own.
-
-        Gives the flag for the host, by field of ``CommandLine``, if its command names another.
-        """
+        """Give what learns a folder of its own, a control always; returns the host's flag."""
         own = own if self.options.settings.goal.presses else "control"
         if own and self.output is not None:
             self.around, self.output = self.output, self.output / own
@@ -286,10 +282,7 @@ class Stages:
         return settings if written == asked else None
 
     def _interrupted(self, error: KeyboardInterrupt, saved: Path | None) -> Interrupted:
-        """The error that reports Ctrl-C or SIGTERM, names the saved model, and says how to go on.
-
-        Stage 2 begins anew from the end of stage 1; no stage 1 is repeated.
-        """
+        """The error for Ctrl-C or SIGTERM: it names what was saved, and says how to go on."""
         by_signal = isinstance(error, Terminate)
         stated, found = (Terminated, "SIGTERM") if by_signal else (Interrupted, "Ctrl-C")
         remedy = "Run the command again."
@@ -344,12 +337,7 @@ class Stages:
             return None, {}, error
 
     def _learn_within(self, from_iter: int, *, joint: bool = False) -> None:
-        """Run the command once, and learn from one of its iterations on, to its end.
-
-        Args:
-            from_iter: the option, or the end of the host's densification.
-            joint: the whole model trains on; else stage 2 begins there.
-        """
+        """Run the command once; after ``from_iter`` it learns, in stage 2 or ``joint``."""
         total, file = self.host.iterations, self.host.flags.resume
         if file:
             self.adapter.expect_resumable(Path(file))
@@ -377,10 +365,7 @@ class Stages:
             self.before = self._model(start, 0.0 if origin else began, origin)
 
     def _model(self, iteration: int, since: float = 0.0, at: Path | None = None) -> Path | None:
-        """The host's PLY of an iteration, or None if the host saved none since this time.
-
-        It is ``at`` itself, or beside that checkpoint, or in the output folder.
-        """
+        """The host's PLY of an iteration, at or beside ``at`` or in the output folder."""
         folder = at.parent if at else self.output
         path = self.adapter.model_file(folder, iteration) if folder else None
         path = at if at and at.suffix == ".ply" else path

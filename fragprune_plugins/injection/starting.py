@@ -38,8 +38,7 @@ _SAFELY: dict[str, Any] = {"weights_only": True, "mmap": True}
 if not hasattr(torch.serialization, "safe_globals"):  # torch before 2.5
     _SAFELY = {"weights_only": False}
 
-FINISHED = "stage1.fragprune-finished"
-"""The mark of a finished stage 1 in the host's output folder, until stage 2 is finished too."""
+FINISHED = "stage1.fragprune-finished"  # in the host's folder, until stage 2 is, too
 
 
 class Start(NamedTuple):
@@ -51,12 +50,7 @@ class Start(NamedTuple):
 
 
 def find(adapter: ScriptAdapter, host: HostCommand, output: Path | None) -> Start:
-    """The file that the command names, else the newest file of stage 1 in its output folder.
-
-    Raises:
-        UsageError: there is no such file.
-        ModelFileError: a checkpoint cannot be read.
-    """
+    """The file that the command names, else the newest file of stage 1 in its output folder."""
     if host.flags.resume:
         path = Path(host.flags.resume)
         ply = path.suffix == ".ply" and not host.line.restarts
@@ -117,20 +111,14 @@ def whole(path: Path) -> bool:
 
 
 def remember(start: Start, host: HostCommand, commit: str) -> None:
-    """Mark stage 1 as finished, so that the same command need not repeat it; see ``finished``.
-
-    Without an output folder in its command there is no mark.
-    """
+    """Mark stage 1 as finished in its output folder, if it has one; see ``finished``."""
     if host.output is not None and host.output.is_dir():
         with replacing(host.output / FINISHED) as mark:
             mark.write_text(_identity(start.path, host, commit))
 
 
 def finished(adapter: ScriptAdapter, host: HostCommand, commit: str) -> Start | None:
-    """The end of stage 1, if an earlier run of the same command finished it and not stage 2.
-
-    None if the command, the host or the file is another one by now.
-    """
+    """The end of stage 1, if an earlier run of this very command finished it and not stage 2."""
     if host.output is None or not (mark := host.output / FINISHED).is_file():
         return None
     known = mark.read_text(errors="replace")
@@ -177,8 +165,7 @@ def resumable(adapter: ScriptAdapter, line: CommandLine, start: Start) -> Iterat
 def holds(start: Path, ply: Path) -> bool:
     """Whether a file that the host can resume holds the Gaussians of a PLY of the same iteration.
 
-    Hosts write the PLY of an iteration before they densify in it, or relocate, and the checkpoint
-    after that.
+    Hosts write a PLY before they densify or relocate in its iteration, a checkpoint after that.
     """
     if start.suffix == ".ply":
         return True
@@ -190,10 +177,9 @@ def holds(start: Path, ply: Path) -> bool:
 
 
 def part_of(start: Path, kept: Tensor | None, folder: Path) -> Path:
-    """A copy of a file that the host can resume, with a part of its Gaussians; itself for None.
+    """A copy of a file to resume, of the same name, with the Gaussians of ``kept``, (N,) bool.
 
-    Whatever has a row for each of its N Gaussians keeps those of ``kept``, (N,) bool: parameters,
-    their moments, statistics, and what else a fork counts. The copy has the file's name.
+    Whatever has a row for each Gaussian keeps a part: parameters, moments, statistics.
     """
     if kept is None:
         return start

@@ -1,8 +1,7 @@
 """The state of a session: its run and its models. Every handler gets it.
 
-In every role but RASTERIZE, the host's function runs unchanged, and the handler follows it. The
-state counts steps itself, because hosts pass iterations with an offset. Each model object has one
-store.
+In every role but RASTERIZE, the host's function runs unchanged, and the handler follows it. Steps
+are counted here, because hosts pass iterations with an offset. Each model object has one store.
 """
 
 from __future__ import annotations
@@ -38,44 +37,27 @@ from fragprune_plugins.types import one_line
 
 @dataclass
 class ModelState:
-    """A model's thresholds and the state of its training.
-
-    Attributes:
-        stage: learns the thresholds; None if thresholds of a sidecar only apply.
-        steps: number of the host's steps since the session saw the model.
-        begun: a step has begun, and its loss has not gone backward.
-        pending_parents: (P,) int64 rows of the parents that the host is about to copy.
-        prepared: the adapter has prepared the model for stage 2.
-        views: by view, a function that draws the view again, from its last visit.
-        newest: the call whose Gaussians these functions draw.
-        seen: views that were drawn to learn from, in the order of their first visits.
-        loaded: the means with which a sidecar's thresholds were loaded.
-        stepped: value of ``steps`` at the last step of the store.
-        pictured: value of ``steps`` when a (view, part) was last drawn to learn from.
-        lent: per running optimizer step, (param group, the host's rate) to restore.
-        drawn: value of ``steps`` when a view was last drawn to learn from.
-        ordered: steps begin, draw, and go backward before optimizers step; None until one did.
-        beside: this view is drawn without gradients or between two such steps: nobody learns.
-    """
+    """A model's thresholds and the state of its training."""
 
     store: ThresholdStore
-    stage: Stage2 | None = None
-    steps: int = 0
-    begun: bool = False
-    pending_parents: Tensor | None = None
-    prepared: bool = False
-    views: dict[Hashable, Callable[[], Any]] = field(default_factory=dict)
-    newest: Any = None
-    seen: dict[Hashable, None] = field(default_factory=dict)
-    loaded: weakref.ReferenceType[Any] | None = None
+    stage: Stage2 | None = None  # None if thresholds of a sidecar only apply
+    steps: int = 0  # the host's, since the session saw the model
+    begun: bool = False  # a step has begun, and its loss has not gone backward
+    pending_parents: Tensor | None = None  # (P,) int64 rows that the host is about to copy
+    prepared: bool = False  # by the adapter, for stage 2
+    views: dict[Hashable, Callable[[], Any]] = field(default_factory=dict)  # each draws it again
+    newest: Any = None  # the call whose Gaussians these draw
+    seen: dict[Hashable, None] = field(default_factory=dict)  # views to learn from, as they came
+    loaded: weakref.ReferenceType[Any] | None = None  # the means that a sidecar was loaded for
     hooked: weakref.WeakSet[Any] = field(default_factory=weakref.WeakSet)
     hooks: list[Any] = field(default_factory=list)
-    stepped: int = -1
-    pictured: dict[tuple[Hashable, int], int] = field(default_factory=dict)
+    stepped: int = -1  # value of ``steps`` at the last step of the store
+    drawn: int = -1  # likewise, when a view was last drawn to learn from
+    pictured: dict[tuple[Hashable, int], int] = field(default_factory=dict)  # by (view, part)
+    # per running optimizer step, (param group, the host's rate) to restore
     lent: list[list[tuple[dict[str, Any], Any]]] = field(default_factory=list)
-    drawn: int = -1
-    ordered: bool | None = None
-    beside: bool = False
+    ordered: bool | None = None  # steps begin, draw, go backward, then optimizers step
+    beside: bool = False  # drawn without gradients, or between two such steps: nobody learns
 
     __repr__ = one_line
 
@@ -157,11 +139,7 @@ class SessionState:
         self.pausing: ContextVar[bool] = ContextVar("paused", default=False)
 
     def engine(self, device: torch.device) -> Engine:
-        """The engine for tensors on a device, created at the first call.
-
-        Raises:
-            EngineError: the engine does not exist or cannot draw there.
-        """
+        """The engine for tensors on a device, created at the first call, or EngineError."""
         if device not in self.engines:
             engine = engine_for(self.engine_name, device, self.plugins)
             if engine.name == "reference":
@@ -240,10 +218,7 @@ class SessionState:
     def write_sidecar(
         self, path: Path, store: ThresholdStore | None, whole: Path | None = None
     ) -> None:
-        """Write a store's sidecar beside a file and tell observers; see ``save``.
-
-        None removes that of an earlier file of this name, which loading would refuse as stale.
-        """
+        """Write a store's sidecar beside a file; None removes that of an earlier file."""
         about: dict[str, Any] = {"adapter": self.adapter.name, "host_commit": self.repo.commit}
         about["settings"], self.held = self.settings.as_dict() | self.midway, None
         if whole is not None:
@@ -269,12 +244,7 @@ class SessionState:
         return store is not None
 
     def take_up(self, model: Any, saved: dict[str, Any]) -> None:
-        """Give a model the thresholds that ``ThresholdStore.state_dict`` gave for its Gaussians.
-
-        Raises:
-            SidecarError: the saved parts do not fit together, or are not finite.
-            AlignmentError: the model has another number of rows.
-        """
+        """Give a model the thresholds that ``ThresholdStore.state_dict`` gave for its Gaussians."""
         store = ThresholdStore(0, self.adapter.means(model).device, self.settings.threshold_lr)
         store.load_state_dict(saved)
         self._give(model, store, "the saved thresholds")

@@ -34,10 +34,7 @@ def on_scene(session: SessionState, call: SeamCall) -> Any:
 
 
 def on_attach(session: SessionState, call: SeamCall) -> Any:
-    """After the host makes an optimizer, give the model thresholds and follow the optimizer.
-
-    A model that already has thresholds keeps them if its rows are the same, else gets neutral ones.
-    """
+    """Give a model with a new optimizer thresholds; its own, if its rows are the same."""
     if session.learn:
         ranks.expect_one()
     model = call.model
@@ -107,22 +104,18 @@ def is_followed(session: SessionState, model: Any, state: ModelState) -> bool:
 
 def hook_optimizers(session: SessionState, model: Any, state: ModelState) -> None:
     """Call ``before_step`` and ``after_step`` around every step of a model's optimizers."""
-    reference = weakref.ref(model)
+    of = session, weakref.ref(model)
     for optimizer in (each() for each in session.optimizers[model]):
-        if optimizer is None or optimizer in state.hooked:
-            continue
-        state.hooked.add(optimizer)
-        before = partial(before_step, session, reference)
-        state.hooks.append(optimizer.register_step_pre_hook(before))
-        after = partial(after_step, session, reference)
-        state.hooks.append(optimizer.register_step_post_hook(after))
+        if optimizer is not None and optimizer not in state.hooked:
+            state.hooked.add(optimizer)
+            state.hooks.append(optimizer.register_step_pre_hook(partial(before_step, *of)))
+            state.hooks.append(optimizer.register_step_post_hook(partial(after_step, *of)))
 
 
 def before_step(session: SessionState, reference: Any, optimizer: Any, *_: Any) -> None:
-    """In stage 2, remove gradients of frozen parameters, so that no optimizer changes them.
+    """In stage 2, remove gradients of frozen parameters, and lend others the rates of stage 2.
 
-    Other parameters get the rates of stage 2, for this step only, because the host saves them in
-    its checkpoints.
+    For this step only, because the host saves rates in its checkpoints.
     """
     model = reference()
     state = session.models.get(model) if model is not None else None
@@ -146,10 +139,7 @@ def before_step(session: SessionState, reference: Any, optimizer: Any, *_: Any) 
 
 
 def after_step(session: SessionState, reference: Any, *_: Any) -> None:
-    """Restore the host's rates, and let the store step once per counted step.
-
-    A host may step several optimizers in one counted step.
-    """
+    """Restore the host's rates; the store steps once, also if the host steps several optimizers."""
     model = reference()
     state = session.models.get(model) if model is not None else None
     if state is None:
@@ -203,9 +193,7 @@ def frozen_parameters(session: SessionState, model: Any) -> list[Tensor]:
 def asking_for_no_gradient(parameters: list[Tensor]) -> Iterator[Callable[[Any], Any]]:
     """Inside, these parameters require no gradient, so an engine does not compute theirs.
 
-    Yields:
-        A function for arguments that the host computed before. It detaches a tensor that depends
-        on these parameters alone, and returns any other value as given.
+    Yields a function that detaches an argument which depends on these parameters alone.
     """
     changed = [parameter for parameter in parameters if parameter.requires_grad]
     known = {id(parameter) for parameter in parameters}

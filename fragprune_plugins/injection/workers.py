@@ -1,7 +1,7 @@
 """Prepares worker processes that a host spawns, for example its DataLoader's.
 
-A spawned worker is a fresh interpreter that imports the host's script. Without preparation it would
-find no stand-ins, and it would draw without thresholds. A forked worker needs nothing.
+A spawned worker imports the host's script anew. Unprepared it would find no stand-ins, and draw
+without thresholds. A forked worker needs nothing.
 """
 
 from __future__ import annotations
