@@ -1,6 +1,6 @@
 """Asks plugins, and gives our own answers if no plugin answers.
 
-Every command, the session of a host and the functions of the package ask here and nowhere else.
+Every command, session and function of the package asks here and nowhere else.
 """
 
 from __future__ import annotations
@@ -66,11 +66,7 @@ def drawn_by(engine: Engine, inputs: RasterInputs, thresholds: Tensor | None) ->
 
 
 def schedule_for(settings: Settings, plugins: Plugins | None = None) -> Schedule:
-    """The schedule of stage 2: a plugin's, or ours.
-
-    Raises:
-        PluginError: a plugin raised, or its answer is not a schedule.
-    """
+    """The schedule of stage 2, a plugin's or ours; PluginError for any other answer."""
 
     def wrong(answer: Any) -> Wrong | None:
         return None if isinstance(answer, Schedule) else (repr(answer), "a schedule (Schedule)")
@@ -85,9 +81,7 @@ def thresholds_for(
 ) -> Tensor | None:
     """The thresholds (N,) to draw with, in falloff; None for no truncation.
 
-    Args:
-        given: a store, for which plugins are asked unless it is neutral; or thresholds to use as
-            they are.
+    Plugins are asked about a store that is not neutral; given thresholds are used as they are.
 
     Raises:
         PluginError: a plugin raised, or its answer is not N thresholds in (0, 1).
@@ -105,11 +99,7 @@ def thresholds_for(
 def select_adapter(
     repo: HostRepo, matches: Sequence[Match], plugins: Plugins | None = None
 ) -> str | None:
-    """The name of the adapter that a plugin prefers if several fit; None if no plugin answers.
-
-    Raises:
-        PluginError: a plugin raised, or named an adapter that does not fit.
-    """
+    """The name of the adapter that a plugin prefers if several fit; None if no plugin answers."""
     names = [match.adapter for match in matches]
 
     def wrong(answer: Any) -> Wrong | None:

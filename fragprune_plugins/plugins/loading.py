@@ -1,8 +1,8 @@
 """Finds, blocks, loads and asks the plugins of this process, one by one.
 
-A plugin that fails never stops the others. A failure at import becomes a finding; a failure in a
-hook is an error that names the plugin. For that, pluggy collects and checks the hooks, and we call
-each ourselves: pluggy's own call would not say whose it was. So wrappers are refused.
+A plugin that fails never stops the others. A failure at import becomes a finding; one in a hook is
+an error that names the plugin. For that, pluggy collects and checks the hooks, and we call each
+ourselves. So wrappers are refused.
 
 Environment: ``FRAGPRUNE_BLOCK`` and ``FRAGPRUNE_ONLY`` take comma-separated entry-point names.
 """
@@ -32,14 +32,9 @@ if TYPE_CHECKING:
 
 GROUP = "fragprune"
 
-Hook = Callable[..., Any]
-"""A function of ``hookspecs``; its name is the hook's."""
-
-Wrong = tuple[str, str]
-"""What was found in an answer, and what was expected."""
-
-_FAULTS = (Exception, SystemExit)
-"""What a plugin may raise without ending the process; Ctrl-C is the user's."""
+Hook = Callable[..., Any]  # a function of ``hookspecs``; its name is the hook's
+Wrong = tuple[str, str]  # what was found in an answer, and what was expected
+_FAULTS = (Exception, SystemExit)  # a plugin may raise these; Ctrl-C is the user's
 
 
 class _Manager(pluggy.PluginManager):
@@ -62,22 +57,15 @@ class _Manager(pluggy.PluginManager):
 
 @dataclass
 class Plugins:
-    """Registered plugins, the adapters that they offer, and findings about failed plugins.
-
-    Attributes:
-        adapters: by name.
-        findings: plugins that were blocked or shadowed, or that failed.
-        loaded: the value of each entry point by its name.
-        engines: created engines, by requested name and device. An engine keeps memory and kernels
-            for its next frame.
-        _off: (plugin, hook) of observers that raised.
-    """
+    """Registered plugins, the adapters that they offer, and findings about failed plugins."""
 
     adapters: list[HostAdapter] = field(default_factory=list)
-    findings: list[Finding] = field(default_factory=list)
-    loaded: dict[str, str] = field(default_factory=dict)
+    findings: list[Finding] = field(default_factory=list)  # also of blocked and shadowed ones
+    loaded: dict[str, str] = field(default_factory=dict)  # values of entry points by name
+    # by requested name and device; an engine keeps memory and kernels for its next frame
     engines: dict[tuple[str, torch.device], Engine] = field(default_factory=dict)
     _manager: pluggy.PluginManager = field(default_factory=_Manager, init=False, repr=False)
+    # (plugin, hook) of observers that raised
     _off: set[tuple[str, str]] = field(default_factory=set, init=False, repr=False)
 
     def register(self, plugin: object, name: str) -> None:
@@ -183,11 +171,7 @@ def installed() -> Plugins:
 
 
 def load_plugins(found: Iterable[EntryPoint] | None = None) -> Plugins:
-    """Load every allowed entry point of the group ``fragprune``, each alone.
-
-    Args:
-        found: entry points to use in place of the installed ones.
-    """
+    """Load all allowed entry points of the group ``fragprune``, or those ``found``, each alone."""
     plugins = Plugins()
     only = _names("FRAGPRUNE_ONLY")
     blocked = _names("FRAGPRUNE_BLOCK")

@@ -1,6 +1,6 @@
 """Entry points of one object each: commands, formats, logs, viewers' bridges. Ours are among them.
 
-A package offers an object by a line in its ``pyproject.toml``, and it is imported on use.
+A package offers an object in its ``pyproject.toml``, and it is imported on use.
 """
 
 from __future__ import annotations
@@ -20,12 +20,9 @@ def _owner(point: EntryPoint) -> str:
 
 @cache
 def offered(group: str) -> dict[str, EntryPoint]:
-    """The entry points of a group by name, sorted.
+    """The entry points of a group by name, sorted, such as of "fragprune.commands".
 
     Of two with one name ours is taken, else the first that is found; a warning names the other.
-
-    Args:
-        group: such as "fragprune.commands".
     """
     points: dict[str, EntryPoint] = {}
     found = entry_points(group=group)
@@ -38,12 +35,7 @@ def offered(group: str) -> dict[str, EntryPoint]:
 
 
 def load(point: EntryPoint, kind: type | tuple[type, ...] = object) -> Any:
-    """Import what an entry point names.
-
-    Args:
-        point: of ``offered``.
-        kind: what it must be an instance of.
-    """
+    """Import what an entry point of ``offered`` names, which must be of a ``kind``."""
     with blaming(point):
         loaded = point.load()
         if not isinstance(loaded, kind):
