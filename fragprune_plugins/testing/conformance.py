@@ -63,13 +63,7 @@ class AdapterConformance:
             root = installed.root
         elif place is None:
             driver.write(tmp_path)
-        return Case(
-            found_adapter(self.adapter),
-            driver,
-            root,
-            examples=self.examples,
-            longest=self.longest_order,
-        )
+        return Case(found_adapter(self.adapter), driver, root, self.examples, self.longest_order)
 
     @pytest.fixture
     def check(self) -> Callable[..., None]:
@@ -128,11 +122,7 @@ class AdapterConformance:
 
 
 def found_adapter(adapter: str | HostAdapter) -> HostAdapter:
-    """Find an adapter by its name; an adapter object is returned as it is.
-
-    Raises:
-        LookupError: no installed adapter has the name.
-    """
+    """The adapter of this name, or itself; LookupError if none is installed."""
     if isinstance(adapter, HostAdapter):
         return adapter
     if adapter not in _installed():

@@ -1,7 +1,6 @@
 """Runs a function in a fresh process, without an imported host or an active session.
 
-A server imports torch and the plugins once and forks for every call, so that a fresh process costs
-milliseconds.
+A server imports torch and the plugins once and forks for every call, which costs milliseconds.
 """
 
 from __future__ import annotations

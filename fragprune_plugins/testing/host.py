@@ -41,8 +41,7 @@ from fragprune_plugins.workbench import demo
 MINIATURE = Path(demo.__file__).with_name("host")
 """The demo's training repository: vanilla 3DGS of 2023 by its interface, small."""
 
-FAINT = -9.0
-"""The opacity's logit in rows that an action makes too faint to keep, before it calls the host."""
+FAINT = -9.0  # logit of opacities that an action makes too faint to keep
 
 
 @dataclass
@@ -81,8 +80,7 @@ Action = Callable[[Any, Any, Chance], None]
 class Host:
     """How to drive one host; override the differences from vanilla 3DGS of 2023.
 
-    ``write`` makes a miniature of the host, so that tests need no checkout. All other methods must
-    work on a real checkout too. A host that is an installed package is used as installed.
+    ``write`` makes a miniature, so tests need no checkout. All else must work on a checkout too.
     """
 
     package: str = ""
@@ -360,11 +358,7 @@ class Running:
 
 @contextlib.contextmanager
 def imported(path: Path, packages: tuple[str, ...] = ()) -> Iterator[None]:
-    """Put a host's folder first on the path; afterwards its modules are forgotten.
-
-    Args:
-        packages: the host's packages, if the folder is that of all installed packages.
-    """
+    """Put a host's folder, or that of its ``packages``, on the path; then forget its modules."""
     known = set(sys.modules)
     sys.path.insert(0, str(path))
     try:
@@ -391,11 +385,11 @@ def running(
     active: bool = True,
     **options: Any,
 ) -> Iterator[Running]:
-    """Import the host in this process under a session, which is activated by default.
+    """Import the host in this process under a session, by default active and with our stand-ins.
 
     Args:
         active: False leaves the session's activation to the caller.
-        options: of the session; by default it uses our stand-ins.
+        options: of the session.
     """
     loaded = load_plugins(_entries())
     for index, plugin in enumerate(plugins or ()):
@@ -449,25 +443,16 @@ def label(host: Running, model: Any) -> None:
     """Mark row i with i, and give it a unique threshold and unique moments."""
     numbers = torch.arange(len(host.adapter.means(model)))
     host.driver.mark(model, numbers)
-    host.store(model).load_state_dict(
-        {
-            "logits": logits_of(numbers),
-            "exp_avg": numbers.float() + 1,
-            "exp_avg_sq": numbers.float() + 1,
-            "adam_step": 2.0,
-            "steps": 2,
-        }
-    )
+    moments = dict.fromkeys(("exp_avg", "exp_avg_sq"), numbers.float() + 1)
+    state = {"logits": logits_of(numbers), **moments, "adam_step": 2.0, "steps": 2}
+    host.store(model).load_state_dict(state)
 
 
 def expect_ancestors(host: Running, model: Any) -> None:
-    """Check that every row has its ancestor's threshold, and its ancestor's moments or none.
+    """Raise AssertionError unless each row has its ancestor's threshold, and its moments or none.
 
     The host itself copies the marks from parents to children, so they tell each row's ancestor. At
     most one descendant of a row may have its moments.
-
-    Raises:
-        AssertionError: names the first row with a wrong threshold.
     """
     store, marks = host.store(model), host.driver.marks(model)
     rows, state = len(host.adapter.means(model)), store.state_dict()
@@ -481,11 +466,9 @@ def expect_ancestors(host: Running, model: Any) -> None:
     right &= state["exp_avg_sq"] == moments  # children start without, as the hosts' do
     if not right.all():
         row = int((~right).nonzero()[0])
-        raise AssertionError(
-            f"row {row} of {rows} descends from {marks[row]} and must have the logit "
-            f"{expected[row]:g} and moments {own[row]:g} or 0; it has {state['logits'][row]:g} "
-            f"and {moments[row]:g}"
-        )
+        said = f"row {row} of {rows} descends from {marks[row]} and must have the logit "
+        said += f"{expected[row]:g} and moments {own[row]:g} or 0; it has "
+        raise AssertionError(f"{said}{state['logits'][row]:g} and {moments[row]:g}")
     held = moments[moments != 0]
     if len(held.unique()) != len(held):
         raise AssertionError(f"two rows have the moments of one: {sorted(held.tolist())}")

@@ -15,11 +15,7 @@ RENAMED = "renamed_by_the_conformance_kit"
 
 
 def copy_source(repo: HostRepo, target: Path, packages: Sequence[str] = ()) -> HostRepo:
-    """A copy of a host's Python files, and nothing else of it.
-
-    Args:
-        packages: the host's packages, if its folder is that of all installed packages.
-    """
+    """A copy of a host's Python files; of these ``packages`` alone, if it is installed."""
     for folder in [repo.root / name for name in packages] or [repo.root]:
         for file in folder.rglob("*.py"):
             if ".git" not in file.parts:
@@ -57,11 +53,7 @@ def rename_parameter(repo: HostRepo, seam: Seam, name: str) -> None:
 
 
 def unpack_one_more(repo: HostRepo, seam: Seam) -> int | None:
-    """Unpack one more value from the rasterizer wherever the seam's function unpacks radii.
-
-    Returns:
-        The line of the first change; None if the function unpacks no radii.
-    """
+    """Unpack one more value where radii are unpacked; the line of the first change, if any."""
     path, function = _definition(repo, seam)
     targets = [
         target

@@ -1,8 +1,7 @@
 """The kit's pytest plugin: a table of adapters and invariants at the end, or in a file.
 
-Load it with ``pytest_plugins =
-["fragprune_plugins.testing.plugin"]`` in the topmost ``conftest.py``, or ``pytest -p
-fragprune_plugins.testing.plugin``.
+Name ``fragprune_plugins.testing.plugin`` in ``pytest_plugins`` of the topmost ``conftest.py``, or
+after ``pytest -p``.
 """
 
 from __future__ import annotations
@@ -78,9 +77,8 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
         terminalreporter.line(line)
     for result in results:
         if result["outcome"] in ("n/a", "skipped"):
-            terminalreporter.line(
-                "{outcome}: {adapter} on {host}, {invariant}: {reason}".format(**result)
-            )
+            told = "{outcome}: {adapter} on {host}, {invariant}: {reason}"
+            terminalreporter.line(told.format(**result))
 
 
 def table(results: list[dict[str, Any]]) -> list[str]:

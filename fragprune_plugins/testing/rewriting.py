@@ -13,11 +13,7 @@ Changes = Sequence[tuple[str, str]]
 
 
 def changed(text: str, changes: Changes) -> str:
-    """Replace each passage in a text.
-
-    Raises:
-        ValueError: a passage does not occur exactly once.
-    """
+    """Replace each passage in a text; ValueError if one does not occur exactly once."""
     for old, new in changes:
         if (count := text.count(old)) != 1:
             raise ValueError(f"{count} times in the text, expected once: {old!r}")

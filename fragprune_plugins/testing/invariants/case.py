@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from fragprune_plugins.errors import FragpruneError
 from fragprune_plugins.hosts.adapter import HostAdapter
 from fragprune_plugins.hosts.seams import Role, Seam
 from fragprune_plugins.hosts.source import HostRepo
@@ -54,11 +56,7 @@ class Case:
         return any(seam.role is role for seam in self.seams)
 
     def expect(self, promise: str, *roles: Role) -> None:
-        """Raise NotApplicable if the host gives a reason why it cannot keep a promise.
-
-        Raises:
-            AssertionError: there is no reason, and a role has no seam.
-        """
+        """Require seams for a promise; NotApplicable if the host states why it cannot keep it."""
         if promise in self.driver.lacks:
             raise NotApplicable(f"{NOT_APPLICABLE}{self.driver.lacks[promise]}")
         missing = [role.name for role in roles if not self.has(role)]
@@ -76,15 +74,21 @@ def require(condition: object, found: str) -> None:
         raise AssertionError(found)
 
 
-class FixedThresholds:
-    """A plugin that answers with fixed thresholds and records the drawn inputs.
+def refused(kind: type[FragpruneError], use: Callable[[], Any], found: str) -> FragpruneError:
+    """The error of this kind that a use raises; AssertionError with a message if it goes on."""
+    try:
+        use()
+    except kind as error:
+        return error
+    raise AssertionError(found)
 
-    ``asking``: the fields of the Gaussians that required a gradient.
-    """
+
+class FixedThresholds:
+    """A plugin that answers with fixed thresholds, and records what is drawn."""
 
     def __init__(self, values: Tensor | None = None) -> None:
         self.values, self.inputs, self.calls = values, None, 0
-        self.asking: set[str] = set()
+        self.asking: set[str] = set()  # fields of the Gaussians that required a gradient
 
     @hookimpl(tryfirst=True)
     def fragprune_truncate(self, inputs: Any, store: Any) -> Tensor | None:
@@ -94,6 +98,13 @@ class FixedThresholds:
         self.asking = {name for name, t in drawn.items() if torch.is_tensor(t) and t.requires_grad}
         self.calls += 1
         return self.values
+
+    def counted(self, host: Running, thresholds: Tensor) -> Any:
+        """``RasterOutputs`` of what was drawn last, with counts and these thresholds."""
+        assert self.inputs is not None
+        engine = host.engine(thresholds.device)
+        with torch.no_grad():
+            return engine.rasterize(replace(self.inputs, counts=True), thresholds)
 
 
 def open_all(host: Running, model: Any) -> Any:

@@ -106,36 +106,25 @@ def monotone(case: Case) -> None:
             chance = Chance(seed, 0.5)
             low, raised = 0.5 * chance.uniform(24), chance.rows(24)
             high = torch.where(raised, low + 0.4 * chance.uniform(24), low)
-            (before, seen), (after, still_seen) = (
-                _counted(host, fixed, model, camera, tau) for tau in (low, high)
-            )
-            own = before.fragments_per_gaussian
-            require((after.fragments_per_gaussian <= own).all(), "a raised threshold added some")
-            require(
-                torch.equal(after.fragments_per_gaussian[~raised], own[~raised]),
-                "a threshold that stood still drew other fragments",
-            )
-            require((after.fragments <= before.fragments).all(), "a pixel has more fragments")
-            require(torch.equal(seen, still_seen), "radii, by which hosts densify, changed")
-            require((seen > 0).any(), "no Gaussian has a radius, by which hosts densify")
-            require(after.fragments.sum() < before.fragments.sum(), "nothing was truncated")
+            radii, drawn = [], []
+            for tau in (low, high):
+                fixed.values = tau
+                radii.append(host.render(camera, model)["radii"])
+                drawn.append(fixed.counted(host, tau))
+            before, after = (each.fragments_per_gaussian for each in drawn)
+            require((after <= before).all(), "a raised threshold added some")
+            same = torch.equal(after[~raised], before[~raised])
+            require(same, "a threshold that stood still drew other fragments")
+            before, after = (each.fragments for each in drawn)
+            require((after <= before).all(), "a pixel has more fragments")
+            require(after.sum() < before.sum(), "nothing was truncated")
+            require(torch.equal(*radii), "radii, by which hosts densify, changed")
+            require((radii[0] > 0).any(), "no Gaussian has a radius, by which hosts densify")
             fixed.values, behind = torch.full((24,), 1 - 1e-6), torch.tensor([0.2, 0.5, 0.9])
             empty = host.render(camera, model, behind)["render"].detach().cpu()
             away = float((empty - behind[:, None, None]).abs().max())
             require(away < 1e-6, f"nothing is drawn, and the background is off by {away:.2g}")
     _no_trace(case)
-
-
-def _counted(
-    host: Running, fixed: FixedThresholds, model: Any, camera: Any, tau: Tensor
-) -> tuple[Any, Tensor]:
-    """Draw through the host with thresholds, then again with counts; returns both and the radii."""
-    fixed.values = tau
-    package = host.render(camera, model)
-    assert fixed.inputs is not None
-    with torch.no_grad():
-        drawn = host.engine(tau.device).rasterize(replace(fixed.inputs, counts=True), tau)
-    return drawn, package["radii"]
 
 
 def _no_trace(case: Case) -> None:
@@ -166,11 +155,8 @@ def _no_trace(case: Case) -> None:
         torch.testing.assert_close(gradient[others], expected[name][others], rtol=1e-4, atol=1e-6)
 
 
-IMAGE_TOLERANCE = 2e-5
-"""About 2^-23 times the fragments of a pixel, with room for terms of both signs."""
-
-GRADIENT_TOLERANCE = 1e-3
-"""Of a tensor's largest entry: float32 sums over all pixels, divided by 1 - alpha >= 0.01."""
+IMAGE_TOLERANCE = 2e-5  # 2^-23 times a pixel's fragments, with room for both signs
+GRADIENT_TOLERANCE = 1e-3  # of the largest: sums in float32, over 1 - alpha >= 0.01
 
 
 def same_picture(case: Case) -> None:
@@ -209,14 +195,10 @@ def _drawn_by(
         store = open_all(host, model)
         package = host.render(camera, model)
         image = package["render"]
-        with torch.no_grad():
-            assert fixed.inputs is not None
-            drawn = host.engine(image.device).rasterize(
-                replace(fixed.inputs, counts=True), store.values
-            )
-        mask = torch.ones_like(drawn.fragments, dtype=torch.bool) if mask is None else mask
+        fragments = fixed.counted(host, store.values).fragments
+        mask = torch.ones_like(fragments, dtype=torch.bool) if mask is None else mask
         weights = Chance(seed, 0.5).uniform(*image.shape) - 0.5
         (image * weights * mask).sum().backward()
         found = host.gradients(model) | {"thresholds": store.logits.grad}
         gradients = {f"gradient of {name}": each for name, each in found.items()}
-    return {"picture": (image * mask).detach(), **gradients}, drawn.fragments
+    return {"picture": (image * mask).detach(), **gradients}, fragments
