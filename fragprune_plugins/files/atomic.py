@@ -1,8 +1,8 @@
 """Writing files so that an existing one is never left half-written, whatever ends the process.
 
-Everything on its way to a file NAME is called ``.fragprune-KEY-...`` in the same folder, KEY being
-made from NAME. Whoever writes holds the lock ``.fragprune-KEY-lock``, which the system frees when
-the process dies: what lies there beside a free lock was left by a dead process, and is removed.
+On its way to a file NAME everything is called ``.fragprune-KEY-...`` beside it, KEY made from NAME.
+Who writes holds the lock ``.fragprune-KEY-lock``, which the system frees when the process dies:
+what lies beside a free lock was left by a dead process, and is removed.
 """
 
 from __future__ import annotations
@@ -20,8 +20,7 @@ from filelock import FileLock, Timeout
 
 from fragprune_plugins.errors import OutputError
 
-WAIT = 60.0
-"""Seconds to wait for another process that writes the same file."""
+WAIT = 60.0  # seconds to wait for another process that writes the same file
 
 _WITHOUT_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL}
 _WITHOUT_LOCKS |= {errno.EACCES, errno.EPERM, errno.EROFS}  # a file, maybe, in a locked folder
@@ -43,10 +42,9 @@ def all_in_flight(path: Path, what: str) -> list[Path]:
 
 @contextlib.contextmanager
 def locked(path: Path, wait: float | None = None, what: str = "lock") -> Iterator[bool]:
-    """Keep other processes out of the same block for the same file.
+    """Keep other processes out of the same block for the same file, whose folder must exist.
 
     Args:
-        path: the file, which need not exist; its folder must.
         wait: seconds to wait for another process; None for ``WAIT``.
         what: tells locks of one file apart; "lock" is for writing it.
 
@@ -109,9 +107,7 @@ def staging(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
-    """Yield the path of a file to write. On success it becomes ``path``, in one step.
-
-    If anything fails inside, ``path`` stays as it was.
+    """Yield the path of a file to write. On success it becomes ``path``, which else stays.
 
     Args:
         durable: after the block it also survives a power cut, which takes some milliseconds more.
@@ -147,8 +143,7 @@ def _permit(new: Path) -> None:
 def rename(old: Path, new: Path) -> None:
     """Rename a file that is on the disk; when this returns, so is its new name.
 
-    What the system cannot bring onto the disk at once, such as the names in some network folders,
-    it brings there in its own time.
+    Some network folders bring names there in their own time.
     """
     os.replace(old, new)
     with contextlib.suppress(OSError):

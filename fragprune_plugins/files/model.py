@@ -12,8 +12,7 @@ from fragprune_plugins.errors import AlignmentError, InputError
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import Rim, Splats, check_fields, one_line
 
-REST_COUNTS = {3 * (degree + 1) ** 2 - 3: degree for degree in range(4)}
-"""The SH degree by the number of values in a row of ``f_rest``."""
+REST_COUNTS = {3 * (degree + 1) ** 2 - 3: degree for degree in range(4)}  # SH degrees
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,10 +125,7 @@ class Model:
         return replace(self, **moved)
 
     def keep(self, mask: Tensor) -> Model:
-        """A copy of the rows where mask (N,) bool is True, in their order.
-
-        Thresholds keep their moments.
-        """
+        """A copy of the rows where mask (N,) bool is True, in their order; moments are kept."""
         store = self.with_rules().thresholds  # a copy, which refuses what is no mask
         store.keep(mask)  # type: ignore[union-attr]
         kept: dict[str, Any] = {name: rows[mask] for name, rows in self.tensors.items()}

@@ -23,14 +23,9 @@ from fragprune_plugins.files.ply_table import HEADER_MAX, Columns, header_lines,
 from fragprune_plugins.files.reading import Reading, UntrustedFile
 from fragprune_plugins.learning.thresholds import ThresholdStore
 
-THRESHOLD_COLUMN = "trunc_threshold"
-"""Holds the thresholds themselves, in falloff, in (0, 1); 0 is read as neutral."""
-
-STOP = "fragprune stop"
-"""Begins the comment that holds a model's stop."""
-
-RIM = "fragprune rim"
-"""Begins the comment that says how a model's thresholds cut, if not hard."""
+THRESHOLD_COLUMN = "trunc_threshold"  # in falloff, in (0, 1); 0 is read as neutral
+STOP = "fragprune stop"  # begins the comment that holds a model's stop
+RIM = "fragprune rim"  # begins the comment that says how a model's thresholds cut, if not hard
 
 XYZ = ("x", "y", "z")
 DC = ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -104,31 +99,29 @@ def _splat(path: Path, columns: Columns, filtered: bool) -> Model:
     scales = SCALES if SCALES[2] in names else SCALES[:2]
     missing = [name for name in (*XYZ, *DC, "opacity", *scales, *ROTATION) if name not in names]
     if missing == list(DC) and "red" not in names:
-        raise ModelFileError(
-            str(path),
-            "activated Gaussians without colours, from a codebase that keeps colours in a network",
-            "a splat with colours and values before activation",
-            "Fine-tune with fragprune run inside that host.",
+        found = (
+            "activated Gaussians without colours, from a codebase that keeps colours in a network"
         )
+        expected = "a splat with colours and values before activation"
+        remedy = "Fine-tune with fragprune run inside that host."
+        raise ModelFileError(str(path), found, expected, remedy)
     if missing:
         expected = "the columns of a Gaussian splat"
         remedy = "A point cloud or mesh is not a trained splat; ns-export writes one with "
         remedy += "--ply-color-mode sh_coeffs. " + _REMEDY
         raise ModelFileError(str(path), f"a PLY without {', '.join(missing)}", expected, remedy)
     if scales != SCALES and not filtered:
-        raise ModelFileError(
-            str(path),
-            "flat Gaussians with two scales, as 2D Gaussian Splatting saves, and no 3D Gaussians",
-            "a splat of 3D Gaussians",
-            "Fine-tune and draw it through its host's own scripts, with fragprune run.",
+        found = (
+            "flat Gaussians with two scales, as 2D Gaussian Splatting saves, and no 3D Gaussians"
         )
+        remedy = "Fine-tune and draw it through its host's own scripts, with fragprune run."
+        raise ModelFileError(str(path), found, "a splat of 3D Gaussians", remedy)
     if FILTER in names and not filtered:
-        raise ModelFileError(
-            str(path),
-            "a Mip-Splatting model, whose 3D filter (filter_3D) changes shapes and opacities",
-            "a splat that is drawn as it is stored",
-            "Fuse the filter first (create_fused_ply.py there), or fine-tune with fragprune run.",
+        found = "a Mip-Splatting model, whose 3D filter (filter_3D) changes shapes and opacities"
+        remedy = (
+            "Fuse the filter first (create_fused_ply.py there), or fine-tune with fragprune run."
         )
+        raise ModelFileError(str(path), found, "a splat that is drawn as it is stored", remedy)
     _expect_no_other(path, [name for name in names if not is_plain(name) and name != FILTER])
     rest = sorted(
         (name for name in names if name.startswith("f_rest_") and name[7:].isdecimal()),
@@ -183,8 +176,7 @@ def _expect_no_other(path: Path, others: list[str]) -> None:
 def read_thresholds(path: Path) -> ThresholdStore | None:
     """The thresholds and the rules that a PLY itself holds; None if it has neither, or is no PLY.
 
-    Raises:
-        ModelFileError: the file is truncated, or a threshold is outside (0, 1).
+    ModelFileError if it is truncated, or a threshold outside (0, 1).
     """
     with open(path, "rb") as file:
         try:
@@ -211,12 +203,7 @@ def _require_finite(path: Path, names: tuple[str, ...], data: np.ndarray[Any, An
 
 
 def expect_drawable(path: Path, splat: Model) -> None:
-    """Check values that were read from a file.
-
-    Raises:
-        ModelFileError: a value is not finite, or a Gaussian's scales or rotation cannot be drawn as
-            they are.
-    """
+    """Raise ModelFileError unless all is finite, and scales and rotations can be drawn."""
     for name in ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation"):
         values = getattr(splat, name)
         _require_finite(path, (name,), values.reshape(len(splat), -1).numpy())

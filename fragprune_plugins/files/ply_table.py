@@ -10,27 +10,14 @@ import numpy as np
 
 from fragprune_plugins.files.reading import MEBIBYTE, Reading
 
-HEADER_MAX = MEBIBYTE
-"""Most bytes of a header; a splat's has some 2,000."""
-
-Columns = dict[str, np.ndarray[Any, Any]]
-"""(N,) each, by name."""
+HEADER_MAX = MEBIBYTE  # most bytes of a header; a splat's has some 2,000
+Columns = dict[str, np.ndarray[Any, Any]]  # (N,) each, by name
 
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-_TYPES = {
-    kind: code
-    for kinds, code in (
-        ("char int8", "i1"),
-        ("uchar uint8", "u1"),
-        ("short int16", "i2"),
-        ("ushort uint16", "u2"),
-        ("int int32", "i4"),
-        ("uint uint32", "u4"),
-        ("float float32", "f4"),
-        ("double float64", "f8"),
-    )
-    for kind in kinds.split()
-}
+_CODES = ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"]
+_OLD = ["char", "uchar", "short", "ushort", "int", "uint", "float", "double"]
+_NEW = ["int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64"]
+_TYPES = dict(zip(_OLD + _NEW, _CODES + _CODES, strict=True))
 
 
 @dataclass
@@ -51,11 +38,7 @@ class _Element:
 
 
 def header_lines(head: bytes) -> tuple[list[bytes], int]:
-    """The lines of a PLY's header, without ``end_header``, and the byte at which it ends.
-
-    Args:
-        head: the file's first ``HEADER_MAX`` bytes, or fewer.
-    """
+    """The lines of a PLY's header, without ``end_header``, and the byte at which it ends."""
     end_of_line = next((end for end in (b"\r\n", b"\n", b"\r") if head[3:].startswith(end)), None)
     if not head.startswith(b"ply") or end_of_line is None:
         raise ValueError("it does not begin with 'ply'")
@@ -69,8 +52,8 @@ def header_lines(head: bytes) -> tuple[list[bytes], int]:
 def read_vertices(reading: Reading) -> Columns:
     """The columns of the element ``vertex``, as the file has them.
 
-    Elements before it are skipped, elements after it are not read. Every announced count is
-    compared with the file's length before anything is allocated.
+    Elements before it are skipped. Every announced count is compared with the file's length before
+    anything is allocated.
 
     Raises:
         KeyError: there is no such element.
@@ -81,10 +64,7 @@ def read_vertices(reading: Reading) -> Columns:
 
 
 def read_elements(reading: Reading, wanted: tuple[str, ...]) -> dict[str, Columns]:
-    """The columns of elements by name, as ``read_vertices`` reads them; "vertex" has to be there.
-
-    A PLY in text gives the element "vertex" only.
-    """
+    """The columns of elements by name, "vertex" among them; of a PLY in text that one only."""
     lines, start = header_lines(reading.file.read(HEADER_MAX))
     order, elements = _parse(reading, lines)
     reading.place = ""
@@ -109,10 +89,8 @@ def _binary(reading: Reading, element: _Element, order: str) -> Columns:
     """The columns of a binary element, from where the file is."""
     kind = element.dtype(order)
     if element.count * kind.itemsize > reading.left:
-        raise EOFError(
-            f"cut off in row {reading.left // kind.itemsize} of {element.count}, "
-            f"{kind.itemsize} bytes each"
-        )
+        row = reading.left // kind.itemsize
+        raise EOFError(f"cut off in row {row} of {element.count}, {kind.itemsize} bytes each")
     rows = np.fromfile(reading.file, dtype=kind, count=element.count)
     if len(rows) != element.count:
         raise EOFError(f"cut off in row {len(rows)} of {element.count}")

@@ -1,7 +1,7 @@
 """Files that somebody else may have written.
 
-A reader has an ``UntrustedFile``. It opens regular files only, so it never waits for a pipe or a
-device, and bounds their size. What a parser raises becomes its one error, with path and place.
+An ``UntrustedFile`` opens regular files only, so it never waits for a pipe or a device, and bounds
+their size. What a parser raises becomes its one error, with path and place.
 """
 
 from __future__ import annotations
@@ -20,9 +20,7 @@ from fragprune_plugins.errors import FragpruneError, InputError
 
 MEBIBYTE = 1 << 20
 
-NESTING = 64
-"""Most levels of a JSON value; what we read has six at most."""
-
+NESTING = 64  # most levels of a JSON value; what we read has six at most
 _SAID = 200  # characters of a parser's own words
 
 
@@ -56,11 +54,7 @@ class Reading:
         return self.size - self.file.tell()
 
     def take(self, count: int) -> bytes:
-        """Read exactly so many bytes.
-
-        Raises:
-            EOFError: the file has fewer; nothing is allocated then.
-        """
+        """Read exactly so many bytes; EOFError, and nothing allocated, if the file has fewer."""
         self._expect(count)
         return self.file.read(count)
 
@@ -108,9 +102,8 @@ class UntrustedFile:
         """Open a file for the length of a block, and state whatever the block raises.
 
         Raises:
-            FragpruneError: its ``error``, if there is no such file, it is no regular file,
-                it is larger than ``limit``, or the block raised. Errors of fragprune pass, except
-                an InputError: it is about a value that the file holds.
+            FragpruneError: its ``error``, for no regular file, one larger than ``limit``, or what
+                the block raised, an InputError too. Other errors of fragprune pass.
         """
         path = Path(path)
         with self.stated(path) as reading, self._open(path) as file:

@@ -1,13 +1,13 @@
 """The sidecar: a safetensors file beside the host's own that carries a threshold store.
 
 ``point_cloud.ply`` gets ``point_cloud.fragprune.safetensors``. Its metadata names the model file's
-digest and row count, so a pair that does not match is refused. The host's file stays as the host
-wrote it. What fragprune writes itself holds its thresholds in its own column, and has no sidecar.
+digest and row count, so a pair that does not match is refused. What fragprune writes itself holds
+its thresholds in its own column, and has no sidecar.
 
 ``replace_pair`` renames twice, and the renaming of the model is what counts. Before it, a sidecar
 whose model is not there yet lies under an address that the model's digest gives; after it, the
-sidecar moves to its usual name. A reader looks at the address first. So model and sidecar always
-belong together, whatever ends the process: both are the old ones, or both are the new ones.
+sidecar moves to its usual name. A reader looks at the address first. So model and sidecar are both
+the old ones, or both the new ones, whatever ends the process.
 """
 
 from __future__ import annotations
@@ -37,19 +37,12 @@ FORMAT = "fragprune-thresholds-1"
 
 @dataclass(frozen=True)
 class SidecarInfo:
-    """The metadata of a sidecar.
+    """The metadata of a sidecar."""
 
-    Attributes:
-        rows: number of Gaussians.
-        model_sha256: digest of the model file it belongs to.
-        adapter: name of the adapter that wrote it, "" when written without a host.
-        host_commit: the host checkout's commit, "" when unknown.
-    """
-
-    rows: int
-    model_sha256: str
-    adapter: str = ""
-    host_commit: str = ""
+    rows: int  # Gaussians
+    model_sha256: str  # of the model file it belongs to
+    adapter: str = ""  # that wrote it, "" without a host
+    host_commit: str = ""  # "" if unknown
     settings: dict[str, Any] = field(default_factory=dict)
 
 
@@ -63,9 +56,7 @@ def thresholds_of(
 ) -> ThresholdStore | None:
     """The thresholds of a file that a host reads: its own column's, else its sidecar's, else None.
 
-    Raises:
-        ModelFileError: the column cannot be read.
-        SidecarError: the sidecar cannot be read, or is another model's.
+    ModelFileError or SidecarError if they cannot be read, or are another model's.
     """
     store = read_thresholds(model)
     if store is not None:
@@ -110,8 +101,6 @@ def save(model: Path, store: ThresholdStore, **about: Any) -> Path:
 
 def replace_pair(path: Path, whole: Path, store: ThresholdStore | None, **about: Any) -> None:
     """Put a finished model file and its thresholds in the place of a model and its sidecar.
-
-    A process that ends in between, or a power cut, leaves the old pair or the new one.
 
     Args:
         whole: the finished file, in a folder that ``atomic.staging`` gave for ``path``.
@@ -189,12 +178,10 @@ def load(
     """Read the sidecar of a model file.
 
     Args:
-        rows: of the model, from whoever has it; others are refused. None takes as many as the
-            sidecar says that it has.
+        rows: of the model, others are refused; None takes as many as the sidecar says that it has.
 
     Raises:
-        SidecarError: missing, unreadable, not finite, written for another model file, or of other
-            rows than the model.
+        SidecarError: missing, unreadable, not finite, or written for another model file or rows.
     """
     state, info = _read(model, find(model) or path_beside(model))
     shape, wanted, name = tuple(state["logits"].shape), digest(model), Path(model).name
@@ -230,13 +217,9 @@ def _read(model: Path, path: Path) -> tuple[dict[str, Any], SidecarInfo]:
             metadata = file.metadata() or {}
             if metadata["format"] != FORMAT:
                 raise ValueError(f"format {metadata['format'][:80]!r}")
-            info = SidecarInfo(
-                rows=int(metadata["rows"]),
-                model_sha256=metadata["model_sha256"],
-                adapter=metadata["adapter"],
-                host_commit=metadata["host_commit"],
-                settings=parse_json(metadata["settings"]),
-            )
+            named = {name: metadata[name] for name in ("model_sha256", "adapter", "host_commit")}
+            settings, rows = parse_json(metadata["settings"]), int(metadata["rows"])
+            info = SidecarInfo(rows, **named, settings=settings)
             if not isinstance(info.settings, dict):
                 raise ValueError("settings that are no object")
             state = {"adam_step": float(metadata["adam_step"]), "steps": int(metadata["steps"])}
