@@ -14,9 +14,7 @@ import torch
 from torch import Tensor
 from torch.optim import optimizer as steps
 
-EPSILON = 1e-15
-"""As the hosts have it: a larger one freezes thresholds whose gradients are tiny."""
-
+EPSILON = 1e-15  # as the hosts have it: a larger one freezes thresholds whose gradients are tiny
 _FUSES = torch.__version__ >= "2.4"  # torch has it for a CPU since then
 
 
@@ -45,8 +43,8 @@ def stepping_fused() -> Iterator[None]:
 def can_be_fused(optimizer: Any, group: dict[str, Any]) -> bool:
     """Whether an optimizer may step a param group in the fused kernel.
 
-    It may if it is torch's own plain Adam that leaves this open, and all that the kernel reads
-    lies in memory as float32 on the CPU, in one order.
+    It may if it is torch's own plain Adam, and all that the kernel reads is contiguous float32 on
+    the CPU.
     """
     if type(optimizer) is not torch.optim.Adam or not _FUSES:
         return False

@@ -20,19 +20,15 @@ from fragprune_plugins.types import Splats
 if TYPE_CHECKING:
     from fragprune_plugins.types import Footprints, RasterInputs, View
 
-SQUARED_RADIUS: Final = 8.0
-"""Squared radius of the ellipses, in standard deviations; exp(-8 / 2) is left there."""
+SQUARED_RADIUS: Final = 8.0  # of the ellipses, in standard deviations; exp(-8 / 2) is left
 
 
 def ellipse_areas(inputs: RasterInputs) -> Tensor:
     """(N,) pixels of the picture that lie in each Gaussian's ellipse; 0 behind the near plane.
 
-    Opacities and thresholds have no part in it. At the picture's edge an ellipse counts with the
-    share of its bounding box that the picture shows. Shapes get gradients; positions get none,
-    for it would be cheapest to leave the picture.
-
-    Args:
-        inputs: of one rasterization; compensation and sample offsets are ignored.
+    Opacities, thresholds, compensation and sample offsets have no part in it. At the picture's edge
+    an ellipse counts with the share of its bounding box that the picture shows. Shapes get
+    gradients; positions get none, for it would be cheapest to leave the picture.
     """
     view, splats = inputs.view, inputs.splats
     if isinstance(splats, Splats):

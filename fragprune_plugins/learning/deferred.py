@@ -41,8 +41,7 @@ class DeferredSignals:
 def between_steps() -> Iterator[DeferredSignals]:
     """Inside, Ctrl-C and SIGTERM wait until the yielded object is called, between two steps.
 
-    So what is kept then is the state after a whole step. A second signal does not wait. Outside the
-    main thread the block changes nothing.
+    A second signal does not wait. Outside the main thread the block changes nothing.
     """
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     main = threading.current_thread() is threading.main_thread()

@@ -70,7 +70,6 @@ class Summary(Progress):
     """Result of a session.
 
     Attributes:
-        adapter: the adapter's name.
         engine: name of the engine that drew stage 2; "" if none drew.
         settings: settings of the fine-tuning.
     """

@@ -11,10 +11,7 @@ from fragprune_plugins.errors import DivergedError
 
 
 def are_finite(tensors: Iterable[Tensor]) -> bool:
-    """Whether all squares of all tensors add up to a finite number: one reduction of each tensor.
-
-    False may also mean that numbers are finite and very large; ``not_finite`` looks closely.
-    """
+    """Whether all squares of all tensors add up to a finite number: False if very large, too."""
     norms = [torch.linalg.vector_norm(each.detach(), dtype=torch.float32) for each in tensors]
     return not norms or bool(torch.stack([n.to(norms[0]) for n in norms]).isfinite().all())
 
@@ -31,12 +28,7 @@ def not_finite(tensors: Mapping[str, Tensor]) -> list[str]:
 
 
 def expect_finite(tensors: Mapping[str, Tensor], where: str) -> None:
-    """Raise DivergedError unless every number of every tensor is finite; rows are counted.
-
-    Args:
-        tensors: (N, ...) each, by the name that a message gives them.
-        where: the training and its step, for the message.
-    """
+    """Raise DivergedError, with the rows counted, unless all tensors (N, ...) are finite."""
     if found := not_finite(tensors):
         expected = "finite numbers"
         remedy = "Nothing of it was saved. Begin again from the model before; if that one is not "

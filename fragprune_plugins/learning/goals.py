@@ -24,20 +24,12 @@ from fragprune_plugins.learning.targets import Target
 
 @dataclass(frozen=True)
 class Goal:
-    """What every goal says.
+    """What every goal says."""
 
-    Attributes:
-        name: in text.
-        learns: thresholds open and learn.
-        presses: a pressure acts on the loss.
-        on_area: it acts on the area of the Gaussians' ellipses, from the first step on, and shapes
-            must move.
-    """
-
-    name: ClassVar[str]
-    learns: ClassVar[bool] = True
-    presses: ClassVar[bool] = True
-    on_area: ClassVar[bool] = False
+    name: ClassVar[str]  # in text
+    learns: ClassVar[bool] = True  # thresholds open and learn
+    presses: ClassVar[bool] = True  # a pressure acts on the loss
+    on_area: ClassVar[bool] = False  # on the ellipses' area, from the first step on; shapes move
 
     def __str__(self) -> str:
         numbers = [f"{number!r}" for number in astuple(self) if number is not None]
@@ -63,11 +55,7 @@ class Goal:
 
 @dataclass(frozen=True)
 class _Weighted(Goal):
-    """A goal with a weight, lambda, which a number may give.
-
-    Attributes:
-        own: the weight for a model that learns from its own pictures.
-    """
+    """A goal with a weight, lambda, which a number may give; ``own`` is that for own pictures."""
 
     own: ClassVar[float] = OWN_PRESSURE
     weight: float | None = None
@@ -161,11 +149,7 @@ GOALS: dict[str, type[Goal]] = {each.name: each for each in (Pressure, Fewer, Po
 
 
 def parse_goal(text: str, goals: Mapping[str, type[Goal]] = GOALS) -> Goal:
-    """The goal that ``str`` made a text of.
-
-    Raises:
-        UsageError: the name is none of a goal, or the number is missing or out of range.
-    """
+    """The goal that ``str`` made a text of; UsageError if it made none."""
     name, _, number = text.partition("=")
     try:
         return goals[name](*([float(number)] if number else []))

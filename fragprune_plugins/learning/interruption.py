@@ -11,9 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
 
-EXIT_CODE = 128 + signal.SIGTERM
-"""Exit code that a shell reports for a process which SIGTERM ended: 143."""
-
+EXIT_CODE = 128 + signal.SIGTERM  # a shell's, of a process that SIGTERM ended: 143
 _AFTER_A_FINALIZER = 0.02  # seconds
 
 

@@ -18,9 +18,8 @@ _C1, _C2 = 0.01**2, 0.03**2
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:
     """(C, H, W) structural similarity at each pixel of two images in [0, 1]; differentiable.
 
-    An 11x11 Gaussian window of sigma 1.5, zero padding at the border as in the hosts' loss, each
-    channel for itself. For a figure to quote use ``figures.metrics.ssim``, which leaves the border
-    out.
+    An 11x11 Gaussian window of sigma 1.5, zero padding at the border as in the hosts' loss. For a
+    figure to quote use ``figures.metrics.ssim``, which leaves the border out.
     """
     maps = torch.stack([image, target, image * image, target * target, image * target])
     mu_x, mu_y, xx, yy, xy = _blur(maps)

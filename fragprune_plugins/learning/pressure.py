@@ -3,10 +3,9 @@
 A fixed lambda transfers between well trained scenes, but not between losses: where a loss is
 larger, or shared by few fragments, it cuts less. The default therefore follows the loss per
 fragment, between two ends. Without the upper one a loss that nothing lowers, such as noise in the
-photographs, would drive lambda up: the fewer fragments are left, the larger their share of it. To
-hit a target, a slow controller corrects lambda in the log domain; thresholds are a slow plant, so
-it starts from the known curve, waits before it trusts an error, and never integrates past its
-limits.
+photographs, would drive lambda up. To hit a target, a slow controller corrects lambda in the log
+domain; thresholds are a slow plant, so it starts from the known curve, waits before it trusts an
+error, and never integrates past its limits.
 """
 
 from __future__ import annotations
@@ -20,11 +19,8 @@ if TYPE_CHECKING:
 
     Figure = float | Tensor
 
-LEAST_PRESSURE = 1e-4
-"""Least lambda by default, for models whose loss per fragment is very small (overfitted ones)."""
-
-MOST_PRESSURE = 4e-4
-"""Largest lambda by default; docs/results.md has what it changes, where the loss is large."""
+LEAST_PRESSURE = 1e-4  # least by default: overfitted models have next to no loss per fragment
+MOST_PRESSURE = 4e-4  # largest by default; docs/results.md has what that changes
 
 OWN_PRESSURE = 1.5e-4
 """The default for a model that learns from its own pictures; its loss is next to nothing at first.
@@ -32,15 +28,9 @@ OWN_PRESSURE = 1.5e-4
 Chosen on photographs that were not used: docs/how-to/without-photographs.md has the figures.
 """
 
-ELASTICITY = 0.1
-"""Per cent of the loss that one per cent of the fragments is worth by default."""
-
-PORTABLE_ELASTICITY = 0.3
-"""Per cent of the loss that one per cent of the ellipses' area is worth without thresholds."""
-
-OWN_AREA_PRESSURE = 3e-4
-"""``OWN_PRESSURE`` on the ellipses' area, for a model that learns from its own pictures."""
-
+ELASTICITY = 0.1  # per cent of the loss that one per cent of the fragments is worth by default
+PORTABLE_ELASTICITY = 0.3  # likewise of the ellipses' area, without thresholds
+OWN_AREA_PRESSURE = 3e-4  # ``OWN_PRESSURE`` on the ellipses' area
 _CURVE_SPEEDUP = 1.62  # fragments before / after that LEAST_PRESSURE gives
 _CURVE_SLOPE = 0.22  # d ln(speedup) / d ln(lambda), measured between 1.45x and 2.6x
 
@@ -98,16 +88,15 @@ class ElasticPressure(PressureRule):
 class StepViews:
     """The views that one training step draws; a host that trains in batches draws several.
 
-    Such a host divides each view's loss by their number, so the pressure must be their mean as
-    well. Their number is known only at the end of a step, so the number of the step before is used,
-    and one in the first step. Figures may be scalars on a device; reading them waits for it.
+    Such a host divides each view's loss by their number, and so must the pressure. It is known at
+    the end of a step, so that of the step before is used. Figures may be scalars on a device.
     """
 
     expected: int = 1
     _rows: list[list[Figure]] = field(default_factory=list)
 
     def begin(self) -> None:
-        """Forget the views of the last step; their number is what the next step expects."""
+        """Forget the views of the last step, except for their number."""
         self.expected = self.drawn or self.expected
         self._rows = []
 

@@ -17,8 +17,7 @@ Train = Literal["opacity", "appearance", "all"]
 FINETUNE_ITERATIONS = 5000
 QUICK_ITERATIONS = 1000
 ITERATIONS_MAX = 10**9
-USUAL_STOP = 0.01
-"""Share of a pixel's light; docs/results.md has the runs that chose it."""
+USUAL_STOP = 0.01  # share of a pixel's light; docs/results.md has the runs that chose it
 
 _DEFAULT_GOAL = Pressure()
 _DECAY = 0.1  # learning rates fall to this share over the run, exponentially
@@ -27,10 +26,8 @@ _DECAY = 0.1  # learning rates fall to this share over the run, exponentially
 _LEARNING_STEPS = 2000
 """Thresholds learn in the last so many, of one view each: where shapes follow, truncating for
 longer still improves the training views and no longer the others."""
-_ELASTICITY_OF_ALL = 2 * ELASTICITY
-"""Of the default pressure: shapes that follow repair deeper cuts."""
-_LEAST_AFTER_DROPOUT = 2e-4
-"""The default pressure's lower end after a warm-up with dropout."""
+_ELASTICITY_OF_ALL = 2 * ELASTICITY  # shapes that follow repair deeper cuts
+_LEAST_AFTER_DROPOUT = 2e-4  # the default pressure's lower end after a warm-up with dropout
 
 
 @dataclass(frozen=True)
@@ -117,11 +114,7 @@ class Settings:
         return {**asdict(self), "goal": str(self.goal)}
 
     def make_pressure(self, elasticity: float | None = None) -> PressureRule:
-        """The pressure these settings ask for.
-
-        Args:
-            elasticity: of the default pressure; by what ``train`` names when None.
-        """
+        """The pressure these settings ask for; ``elasticity`` replaces that of ``train``."""
         own = _ELASTICITY_OF_ALL if self.train == "all" else ELASTICITY
         rule = self.goal.pressure(own if elasticity is None else elasticity, self.itself)
         after_dropout = elasticity is None and self.dropout and self.warmup
@@ -187,8 +180,7 @@ class Schedule:
     Subclass and return an instance from ``fragprune_create_schedule`` to change it.
 
     Args:
-        warmup: steps without truncation; ``Settings.warmup`` when None, which is none in a run of
-            2,000 steps or less.
+        warmup: steps without truncation; ``Settings.warmup`` when None.
     """
 
     def __init__(self, settings: Settings, warmup: int | None = None) -> None:
@@ -219,11 +211,7 @@ def _share(steps: int, of: int) -> float:
 
 
 class JointSchedule(Schedule):
-    """Thresholds learn inside the host's own training, whose length ``iterations`` is.
-
-    Args:
-        from_step: first step that learns.
-    """
+    """Thresholds learn from a step on in the host's own training, of ``iterations`` steps."""
 
     def __init__(self, settings: Settings, from_step: int) -> None:
         super().__init__(settings)

@@ -37,17 +37,10 @@ from fragprune_plugins.learning.schedule import JointSchedule, Schedule, Setting
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.types import RasterInputs, RasterOutputs
 
-RESET, MOSTLY = 0.0101, 0.9
-"""Opacity that a host's reset leaves at most, and the share of Gaussians that have no more then."""
-
-LOOKED_AT_EVERY = 10
-"""Steps from one look at all parameters to the next: a look reads all of them."""
-
-OPAQUE = 0.999
-"""Most that an opacity becomes to make up for Gaussians that a step leaves out."""
-
-CURVE_POINTS = 100
-"""Thresholds' median, a sort of all rows, is taken this often in a run."""
+RESET, MOSTLY = 0.0101, 0.9  # the most opacity, in what share of Gaussians, after a reset
+LOOKED_AT_EVERY = 10  # steps from one look at all parameters to the next: a look reads all of them
+OPAQUE = 0.999  # most that an opacity becomes to make up for Gaussians that a step leaves out
+CURVE_POINTS = 100  # thresholds' median, a sort of all rows, is taken this often in a run
 
 _STORED = ("adam_step", "steps", "stop", "rim")
 _COUNTED = ("steps", "taken", "_open", "_held", "_median")
@@ -57,8 +50,7 @@ View = TypeVar("View")
 Truncate = Callable[[RasterInputs, ThresholdStore], Tensor | None]
 """Gives the thresholds (N,) to draw one rasterization with; None draws without."""
 
-_Picture = tuple[Hashable, int]
-"""A view, and the part of it."""
+_Picture = tuple[Hashable, int]  # a view, and the part of it
 
 
 def evenly_spaced(views: Sequence[View], most: int) -> Sequence[View]:
@@ -138,10 +130,7 @@ class Stage2:
         return (view, 0) in self._before
 
     def begin(self, opacities: Callable[[], Tensor]) -> StepPlan:
-        """A step begins.
-
-        Args:
-            opacities: gives the activated opacities, (N,) or (N, 1), when they are needed.
+        """A step begins. ``opacities`` gives activated ones, (N,) or (N, 1), if they are needed.
 
         Raises:
             ResetError: thresholds would begin to learn right after a reset of opacities.
@@ -170,7 +159,7 @@ class Stage2:
     def _expect_no_reset(self, opacities: Tensor) -> None:
         """A picture of Gaussians that are hardly there teaches nothing: it has no fragments to cut.
 
-        Its loss is so large beside its fragments that the pressure would end what is left of it.
+        The pressure, beside so large a loss, would end what is left of it.
         """
         opacities = self._everywhere(opacities)
         share = float((opacities <= RESET).float().mean()) if opacities.numel() else 0.0
@@ -204,8 +193,8 @@ class Stage2:
 
         The others are the more opaque, so that a pixel keeps its light in the mean. A model that
         knows its photographs by heart then learns what holds without any single Gaussian
-        (DropGaussian, CVPR 2025). The share falls to nothing over the run. Pictures without a
-        gradient are whole; the global random streams are not touched.
+        (DropGaussian, CVPR 2025). Pictures without a gradient are whole; the global random streams
+        are not touched.
         """
         share = 0.0 if self.plan is None else 1 - self.plan.progress
         share *= self.settings.dropout or 0.0
@@ -265,12 +254,7 @@ class Stage2:
         self._views.lose(loss.detach())
 
     def rate(self, name: str, base: float) -> float:
-        """The learning rate in this step of a parameter group that the driver trains.
-
-        Args:
-            name: of the group; "opacity" has a rate of its own.
-            base: the rate that the group had when stage 2 began.
-        """
+        """The learning rate of a group in this step, by its name and its rate before stage 2."""
         if self.plan is None:
             return base
         if name == "opacity" and self.plan.opacity_lr is not None:
@@ -278,11 +262,7 @@ class Stage2:
         return base * self.plan.decay
 
     def expect_sound(self) -> None:
-        """Check gradients before the driver's optimizer steps, those of the thresholds too.
-
-        Raises:
-            DivergedError: a gradient, or its square, is NaN or infinite.
-        """
+        """Raise DivergedError if a gradient, or its square, is NaN or infinite."""
         given = {**self.parameters(), "thresholds": self.store.logits}.items()
         known = {name: each.grad.to_dense() for name, each in given if each.grad is not None}
         if are_finite(known.values()):
@@ -299,8 +279,7 @@ class Stage2:
         """The driver's optimizer has stepped: so do the thresholds.
 
         Raises:
-            DivergedError: NaN or infinity in the thresholds; every tenth step, and after the last,
-                in what the driver trains, too.
+            DivergedError: NaN or infinity in them; every tenth step and in the last in all else.
         """
         if self.plan is None:  # a step before stage 2 is the driver's own
             return
@@ -322,13 +301,7 @@ class Stage2:
         if math.isnan(self._median) or self.steps % every == 0:
             self._median = float(self._everywhere(self.store.values.detach()).median())
         fragments, untruncated, pressed = views.means()
-        stats = StepStats(
-            step=self.steps,
-            fragments_per_pixel=fragments,
-            pressure=self.pressure.value,
-            threshold_median=self._median,
-            loss=views.loss,
-        )
+        stats = StepStats(self.steps, fragments, self.pressure.value, self._median, views.loss)
         if self.learning:
             ratio = max(untruncated, 1e-9) / max(pressed, 1e-9)
             if self.target is not None:
@@ -368,7 +341,7 @@ class Stage2:
     ) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Tensors and plain values from which ``load_state_dict`` goes on, between two steps.
 
-        They hold the thresholds, but nothing that the driver owns.
+        They hold nothing that the driver owns.
 
         Args:
             order: all views, in the order that they have at every start; that of ``views`` if None.
@@ -438,7 +411,7 @@ class Stage2:
 
 
 def stored_thresholds(tensors: Mapping[str, Tensor], plain: Mapping[str, Any]) -> dict[str, Any]:
-    """The state of the thresholds in what ``Stage2.state_dict`` gave, for a store of their own."""
+    """The state of the store in what ``Stage2.state_dict`` gave."""
     state = dict(zip(_STORED, plain["store"], strict=True))
     return {**tensors, **state, "rim": state["rim"] or "hard"}
 

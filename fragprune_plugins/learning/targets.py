@@ -1,7 +1,6 @@
 """A ratio that thresholds are held to, before over after, and the shift that meets it.
 
-Stage 2 asks its target, late in the run, to meet the ratio. This one is of fragments; one of what
-follows them, such as the time of a frame, overrides it.
+This one is of fragments; one of what follows them, such as the time of a frame, overrides it.
 """
 
 from __future__ import annotations
@@ -14,33 +13,17 @@ from fragprune_plugins.learning.plain import put
 if TYPE_CHECKING:
     from fragprune_plugins.learning.thresholds import ThresholdStore
 
-TOLERANCE = 0.05
-"""A target counts as reached within this relative distance."""
-
-FEWEST = 20
-"""No target makes fragments fewer than this many times."""
-
-CALIBRATE_AT = 0.85
-"""Share of the learning after which one shift of all thresholds meets the target, and they stay."""
-
-CALIBRATION_VIEWS = 24
-"""Number of training views that a calibration measures at most."""
-
+TOLERANCE = 0.05  # a target counts as reached within this relative distance
+FEWEST = 20  # no target makes fragments fewer than this many times
+CALIBRATE_AT = 0.85  # share of the learning after which a shift meets the target, and they stay
+CALIBRATION_VIEWS = 24  # number of training views that a calibration measures at most
 _REACH = 8.0  # largest shift either way, in logits
 
 
 class Target:
-    """Meets a ratio of fragments.
+    """Meets a ratio of fragments, untruncated over truncated."""
 
-    Args:
-        ratio: untruncated over truncated.
-
-    Attributes:
-        figure: the name under which the ratio that was met is reported.
-        met: the ratio that was met; None before.
-    """
-
-    figure: ClassVar[str] = "speedup"
+    figure: ClassVar[str] = "speedup"  # under which the ratio that was met is reported
 
     def __init__(self, ratio: float) -> None:
         self.ratio = ratio
@@ -54,12 +37,7 @@ class Target:
         """Measure by the way, before any step until ``meet``; ``ratio`` and ``views`` as there."""
 
     def meet(self, store: ThresholdStore, ratio: Callable[[], float], views: Sequence[Any]) -> None:
-        """Shift all thresholds onto the target.
-
-        Args:
-            ratio: draws the views and gives the ratio of their fragments.
-            views: that calibration measures.
-        """
+        """Shift all thresholds onto the target; ``ratio`` draws the views and gives theirs."""
         self.met = calibrate(store, ratio, self.ratio)
 
     def state(self) -> dict[str, Any]:
@@ -85,7 +63,6 @@ def calibrate(
     nearest end is kept. Call it late in the run and let opacities adapt afterwards.
 
     Args:
-        store: the thresholds; changed in place.
         ratio: before over after, with the store as it stands.
         tolerance: relative distance at which to stop.
         rounds: most measurements.

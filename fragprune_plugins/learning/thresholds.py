@@ -1,7 +1,7 @@
 """The threshold store: one truncation threshold per Gaussian of one model, and its optimizer.
 
-Hosts index their optimizer's groups by name and fail on a foreign one, so the store owns its own
-Adam. Row operations mirror what hosts do to theirs, moments included.
+Hosts' optimizers fail on a foreign group, so the store owns its own Adam. Row operations mirror
+what hosts do to theirs, moments included.
 """
 
 from __future__ import annotations
@@ -24,8 +24,7 @@ _ROUNDING = 1e-4  # relative: sigmoid of logit loses less, unless the logit had 
 
 Known = TypeVar("Known")
 
-_Noted = tuple[Tensor, int, Known]
-"""Logits, their version, and what is known of them until they change."""
+_Noted = tuple[Tensor, int, Known]  # logits, their version, what is known of them
 
 
 class ThresholdStore:
@@ -335,22 +334,17 @@ class ThresholdStore:
         rows = torch.as_tensor(rows, dtype=torch.int64, device=self.logits.device)
         inside = rows.ndim == 1 and bool(((rows >= 0) & (rows < len(self))).all())
         if not inside or len(rows) != count:
-            raise AlignmentError(
-                f"ThresholdStore.{operation}",
-                f"{len(rows)} row indices for {count} rows",
-                f"{count} indices in [0, {len(self)})",
-                "Report this with the host's name: its rows changed in a way the adapter misread.",
-            )
+            found = f"{len(rows)} row indices for {count} rows"
+            expected = f"{count} indices in [0, {len(self)})"
+            why = "Report this with the host's name: its rows changed in a way the adapter misread."
+            raise AlignmentError(f"ThresholdStore.{operation}", found, expected, why)
         return rows
 
     def _expect(self, count: int, operation: str) -> None:
         if count != len(self):
-            raise AlignmentError(
-                f"ThresholdStore.{operation}",
-                f"{count} Gaussians",
-                f"{len(self)}, one per threshold",
-                "Report this with the host's name: its rows changed, and the store was not told.",
-            )
+            found, expected = f"{count} Gaussians", f"{len(self)}, one per threshold"
+            why = "Report this with the host's name: its rows changed, and the store was not told."
+            raise AlignmentError(f"ThresholdStore.{operation}", found, expected, why)
 
 
 def _misfit(found: str, expected: str) -> SidecarError:
