@@ -70,8 +70,7 @@ def device_for(wanted: str = "auto", engine: str = "auto") -> torch.device:
 def create_engine(name: str, device: torch.device | str = "cpu") -> Engine:
     """Create one of our own engines by name; "auto" is the fastest that runs on the device.
 
-    On a GPU that is the cuda engine, once it has passed the check there
-    (``engines.cuda.self_check``).
+    On a GPU that is the cuda engine, once it has passed ``engines.cuda.self_check`` there.
 
     Raises:
         EngineError: the name is unknown, or the engine cannot run here.

@@ -17,11 +17,8 @@ from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.errors import EngineError
 from fragprune_plugins.types import Compensation, RasterInputs, Splats
 
-Wanted = frozenset[str]
-"""Inputs that gradients are wanted of, by the names of fragprune_input_grads."""
-
-_COMPENSATIONS: Final = get_args(Compensation)
-"""In the order of enum fragprune_compensation."""
+Wanted = frozenset[str]  # inputs that gradients are wanted of, as fragprune_input_grads names them
+_COMPENSATIONS: Final = get_args(Compensation)  # in the order of enum fragprune_compensation
 
 _SCALARS: Final = (
     *("width", "height", "tan_fov_x", "tan_fov_y", "scale_modifier", "dilation", "near"),
@@ -29,8 +26,7 @@ _SCALARS: Final = (
 )
 """Of fragprune_inputs: those of a view and of ``RasterInputs`` that have the same names there."""
 
-SMALL = 1 << 16
-"""Bytes below which the C library has memory at hand itself."""
+SMALL = 1 << 16  # bytes below which the C library has memory at hand itself
 
 
 def plain(
@@ -52,12 +48,7 @@ def empty(workspace: binding.Workspace, *shape: int, dtype: torch.dtype = torch.
 
 
 def run(library: binding.Library, function: str, *arguments: Any) -> None:
-    """Call a function of the C interface, structs by reference.
-
-    Raises:
-        MemoryError: there is not enough memory.
-        EngineError: the inputs were refused.
-    """
+    """Call a function of the C interface, structs by reference; EngineError if it refuses them."""
     error = binding.Error()
     passed = (
         ctypes.byref(each) if isinstance(each, ctypes.Structure) else each
@@ -76,12 +67,7 @@ def run(library: binding.Library, function: str, *arguments: Any) -> None:
 def native_arrays(
     inputs: RasterInputs, thresholds: Tensor | None, where: torch.device | str = "cpu"
 ) -> dict[str, Tensor]:
-    """The tensors that the engine reads, after ``plain``, by their names in fragprune_inputs.
-
-    Args:
-        inputs: the rasterization; the values of ``means2d_hook`` are not used.
-        thresholds: (N,) or None, already checked by ``inputs.check_thresholds``.
-    """
+    """The tensors that the engine reads, after ``plain``, by their names in fragprune_inputs."""
     given = vars(inputs.view) | vars(inputs.splats) | vars(inputs) | {"thresholds": thresholds}
     return {
         name: plain(given[name], where, torch.int32 if name == "tiles" else torch.float32)
@@ -98,12 +84,9 @@ def native_inputs(
     threads: int = 1,
     workspace: int | None = None,
 ) -> binding.Inputs:
-    """Fill the struct fragprune_inputs. It points into the arrays, which must outlive it.
+    """Fill the struct fragprune_inputs. It points into ``native_arrays``, which must outlive it.
 
-    Args:
-        inputs: the rasterization. ``counts`` and ``scores`` are ignored: they choose outputs.
-        arrays: the result of ``native_arrays``.
-        widen: thresholds will want a gradient.
+    ``counts`` and ``scores`` are ignored: they choose outputs. ``widen``: thresholds learn.
     """
     splats, given = inputs.splats, vars(inputs.view) | vars(inputs)
     return binding.Inputs(
@@ -127,11 +110,9 @@ def native_inputs(
 def new_outputs(
     inputs: RasterInputs, new: Callable[..., Tensor], planes: Collection[str]
 ) -> dict[str, Tensor]:
-    """Room for what is drawn of any Gaussians by any engine, by the names of fragprune_outputs.
+    """Room for what is drawn by any engine, by the names of fragprune_outputs, of ``planes`` these.
 
-    Args:
-        new: makes a tensor of a shape, float32 unless it is given a ``dtype``.
-        planes: those to have room for.
+    ``new`` makes a tensor of a shape, float32 unless it is given a ``dtype``.
     """
     n, size, whole = len(inputs.splats), (inputs.view.height, inputs.view.width), torch.int32
     made = {"image": new(3, *size), "radii": new(n, dtype=whole)}
@@ -169,8 +150,7 @@ _LEARNABLE = tuple(name for name, *_ in binding.InputGrads._fields_[1:])
 _DIFFERENTIABLE = ("image", "invdepth", "alpha", "features", "surface", "fragments_per_pixel")
 _FELT_BY = dict.fromkeys(_DIFFERENTIABLE, frozenset(_LEARNABLE))
 
-Draw = Callable[[Wanted], Mapping[str, Tensor]]
-"""A forward pass: the outputs by name."""
+Draw = Callable[[Wanted], Mapping[str, Tensor]]  # a forward pass: the outputs by name
 
 Undraw = Callable[[Wanted, dict[str, Tensor]], dict[str, Tensor]]
 """A backward pass, from gradients of outputs to gradients of the wanted inputs, by name."""
@@ -189,15 +169,12 @@ def with_gradients(
 def in_graph(
     tensors: Mapping[str, Tensor], draw: Draw, undraw: Undraw, felt_by: Mapping[str, Wanted]
 ) -> dict[str, Tensor]:
-    """Run compiled code in torch's graph, where it can be differentiated once.
+    """Run compiled code in torch's graph, where it can be differentiated once; gives its outputs.
 
     Args:
         tensors: what may want gradients, by name; on any device and of any floating type.
         felt_by: by an output's name, the inputs that it depends on. One that depends on none whose
             gradients are wanted gets no gradient.
-
-    Returns:
-        What ``draw`` gave.
     """
     if not torch.is_grad_enabled():  # the function would be told that parameters want theirs
         tensors = {name: each.detach() for name, each in tensors.items()}

@@ -20,7 +20,6 @@ def fragments(
 
     Args:
         inputs: Gaussians in the world.
-        thresholds: (N,) falloff in (0, 1), or None for no truncation.
         tiles: how many tiles are looked at, at most, evenly spread; None for all.
     """
     assert isinstance(inputs.splats, Splats)
@@ -30,10 +29,5 @@ def fragments(
     every = 1 if tiles is None else -(-across * down // tiles)
     while math.gcd(every, across) > 1:  # else the same columns of every row
         every += 1
-    return blended(
-        camera_of(inputs),
-        gaussians_of(inputs.splats),
-        thresholds,
-        options=options_of(inputs),
-        every=every,
-    )
+    drawn = camera_of(inputs), gaussians_of(inputs.splats), thresholds
+    return blended(*drawn, options=options_of(inputs), every=every)

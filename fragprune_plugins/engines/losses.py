@@ -20,13 +20,12 @@ def compiled_loss(
 ) -> Tensor:
     """(1 - ssim_weight) L1 + ssim_weight (1 - SSIM) of two images, by the compiled code.
 
-    The same to the bit for any number of threads.
+    The same to the bit for any number of threads. SSIM is the mean over all pixels and channels of
+    ``learning.losses.ssim_map``.
 
     Args:
         image: (C, H, W) float32 on a CPU, in any memory layout; differentiable, once.
         target: likewise, but a constant.
-        ssim_weight: factor on 1 - SSIM, the mean over all pixels and channels as in
-            ``learning.losses.ssim_map``; the mean absolute difference has the rest.
         library: the build to use; None for the best one on this machine.
 
     Raises:

@@ -15,15 +15,9 @@ from typing import Any, Final
 from fragprune_plugins import native
 from fragprune_plugins.errors import EngineError
 
-API_VERSION: Final = 11
-"""FRAGPRUNE_API_VERSION of ``include/fragprune.h`` that this module speaks."""
-
-ENVIRONMENT: Final = "FRAGPRUNE_NATIVE"
-"""Set to off, baseline, avx2 or avx512 to override the choice."""
-
-BUILDS: Final = {"avx512": 2, "avx2": 1, "baseline": 0}
-"""Best first, each with the bit of fragprune_cpu_features that it needs."""
-
+API_VERSION: Final = 11  # FRAGPRUNE_API_VERSION of ``include/fragprune.h`` that this module speaks
+ENVIRONMENT: Final = "FRAGPRUNE_NATIVE"  # off, baseline, avx2 or avx512 overrides the choice
+BUILDS: Final = {"avx512": 2, "avx2": 1, "baseline": 0}  # best first, with bits of cpu_features
 _SUFFIX: Final = ".pyd" if os.name == "nt" else ".so"  # as setup.py names them
 
 OK: Final = 0
@@ -199,11 +193,7 @@ def open_build(build: str) -> Library:
 
 
 def cpu_features() -> int:
-    """This machine's bits of fragprune_cpu_features; the baseline tells, which runs anywhere.
-
-    Raises:
-        Unavailable: that build cannot be opened.
-    """
+    """This machine's bits of fragprune_cpu_features, by the baseline, or Unavailable."""
     return int(open_build("baseline").calls.fragprune_cpu_features())
 
 

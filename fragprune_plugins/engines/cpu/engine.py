@@ -29,25 +29,16 @@ _STAGES = ("projection", "binning", "blend")
 
 @dataclass
 class _Drawing:
-    """One forward pass: its non-differentiable inputs, and the data that it leaves for backward.
-
-    Attributes:
-        arrays: the tensors that C code reads; they live as long as its state.
-        state: the address of the data that backward needs, which are freed with the drawing; None
-            if no gradients are needed.
-        evaluated: (Gaussian, pixel) lanes that were computed.
-        entries: (Gaussian, tile) pairs that were blended.
-        stages: milliseconds by stage.
-    """
+    """One forward pass: its non-differentiable inputs, and the data that it leaves for backward."""
 
     inputs: RasterInputs
     library: binding.Library
     workspace: binding.Workspace
-    arrays: dict[str, Tensor]
-    state: int | None = None
-    evaluated: int = 0
-    entries: int = 0
-    stages: dict[str, float] = field(default_factory=dict)
+    arrays: dict[str, Tensor]  # which C code reads for as long as its state lives
+    state: int | None = None  # address of what backward needs, freed with the drawing
+    evaluated: int = 0  # (Gaussian, pixel) lanes that were computed
+    entries: int = 0  # (Gaussian, tile) pairs that were blended
+    stages: dict[str, float] = field(default_factory=dict)  # milliseconds
 
     def draw(self, wanted: Wanted) -> dict[str, Tensor]:
         """Run the forward pass."""
@@ -97,11 +88,8 @@ class _Drawing:
 class CpuEngine:
     """Rasterizes with the compiled library; results are the same, to the bit, for any threads.
 
-    Args:
-        library: the build to use; None for the best one on this machine.
-
     Attributes:
-        workspace: its reusable memory.
+        library: the build that is used, by default the best one on this machine.
         sh_apart: it reads ``Splats.sh_rest``, so that nobody needs to join the coefficients.
     """
 

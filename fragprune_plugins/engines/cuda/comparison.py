@@ -1,9 +1,8 @@
 """Compares the cuda engine with engines that need no GPU, on frames of many thread blocks.
 
-Large frames are compared with the cpu engine's, small frames with the oracle's, and
-sorted keys with torch's. Repeated frames must be the same and must not accumulate memory.
-
-As a program it is the process that ``self_check`` starts.
+Large frames are compared with the cpu engine's, small frames with the oracle's, and sorted keys
+with torch's. Repeated frames must be the same and must not accumulate memory. As a program it is
+the process that ``self_check`` starts.
 """
 
 from __future__ import annotations
@@ -41,30 +40,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Workload:
-    """How much is drawn.
+    """How much is drawn. Sizes are in pixels."""
 
-    Attributes:
-        keys: to sort.
-        gaussians: of the large frame; some tiles' lists are longer than a block's 256 threads.
-        size: of the large frame, pixels.
-        wide_gaussians: of the wide frame.
-        wide_size: of the wide frame, pixels; so many tiles that sorting needs three passes.
-        steps: how often the large frame is drawn and differentiated.
-    """
-
-    keys: int = 3_000_000
-    gaussians: int = 300_000
+    keys: int = 3_000_000  # to sort
+    gaussians: int = 300_000  # some tiles' lists are longer than a block's 256 threads
     size: tuple[int, int] = (1237, 822)
     wide_gaussians: int = 20_000
-    wide_size: tuple[int, int] = (4112, 4112)
-    steps: int = 50
+    wide_size: tuple[int, int] = (4112, 4112)  # so many tiles that sorting needs three passes
+    steps: int = 50  # how often the large frame is drawn and differentiated
 
 
 def compare(gpu: Device, where: torch.device, workload: Workload | None = None) -> list[str]:
-    """Describe every difference of the cuda engine; empty if all is well.
-
-    Without the cpu engine, large frames are only compared with their repetitions.
-    """
+    """All differences of the cuda engine. Without a cpu engine large frames are only repeated."""
     workload = Workload() if workload is None else workload
     return [
         *_sorting(gpu, where, workload.keys),
@@ -185,10 +172,7 @@ def scene(count: int, size: tuple[int, int], extent: float) -> tuple[RasterInput
 
     At least one of each thousand is a giant, half as wide as the picture: all threads of a warp
     write its tiles, in several rounds if the picture has more than 32 rows of tiles. Some lie off
-    the picture or behind the camera.
-
-    Args:
-        extent: median of the standard deviations, pixels.
+    the picture or behind the camera. ``extent`` is the median standard deviation, pixels.
     """
     generator = torch.Generator().manual_seed(count)
     width, height = size
@@ -227,11 +211,8 @@ def on(
         tensors = {k: t for k, t in vars(value).items() if isinstance(t, torch.Tensor)}
         return {name: tensor.to(where, dtype) for name, tensor in tensors.items()}
 
-    return replace(
-        inputs,
-        view=replace(inputs.view, **moved(inputs.view)),
-        splats=replace(inputs.splats, **moved(inputs.splats)),
-    )
+    view = replace(inputs.view, **moved(inputs.view))
+    return replace(inputs, view=view, splats=replace(inputs.splats, **moved(inputs.splats)))
 
 
 def drawn_and_learned(

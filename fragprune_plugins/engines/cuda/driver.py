@@ -1,7 +1,7 @@
 """Runs kernels on a GPU: the only place that calls CUDA's driver.
 
-Streams and contexts are torch's. A kernel goes to torch's current stream on the tensors' device.
-torch's current device may be another one, and does not change.
+Streams and contexts are torch's. A kernel goes to torch's current stream on the tensors' device,
+which need not be torch's current device.
 """
 
 from __future__ import annotations

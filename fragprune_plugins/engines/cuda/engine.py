@@ -29,15 +29,12 @@ class CudaEngine:
         deterministic: make gradients the same to the bit in each run, at the cost of time and
             memory; None follows torch.use_deterministic_algorithms. Images are always the same.
 
-    Attributes:
-        capacity: entries of the tiles' lists that there is room for; grows with what frames need.
-
     Raises:
         EngineError: kernels cannot be compiled or run here; the message says why.
     """
 
     name = "cuda"
-    capacity = 1 << 20
+    capacity = 1 << 20  # entries of the tiles' lists that there is room for; grows with frames
 
     def __init__(self, device: Device | None = None, *, deterministic: bool | None = None) -> None:
         self.device = _driver(missing()) if device is None else device

@@ -35,11 +35,8 @@ DIGITS: Final = 256
 BRUSH: Final = 12
 COUNTERS: Final = 4 * 8 + 4 * (2 + 2 * PASSES)
 
-ENTRIES_MAX: Final = (1 << 30) - 1
-"""Most entries of all tiles' lists: the sort counts with 30 bits."""
-
-OFFSET_MAX: Final = 1e6
-"""Farthest that a pixel may be sampled from its place, as in the cpu engine."""
+ENTRIES_MAX: Final = (1 << 30) - 1  # most entries of all tiles' lists: the sort counts with 30 bits
+OFFSET_MAX: Final = 1e6  # farthest that a pixel may be sampled from its place, as in the cpu engine
 
 _GEOMETRY: Final = frozenset(
     ("means", "hook", "scales", "rotations", "cov3d", "means2d", "conics", "depths")
@@ -121,9 +118,7 @@ def unblend_macros(
 ) -> dict[str, int]:
     """The macros with which native/cuda/unblend.cu is compiled.
 
-    Args:
-        sh_turns: whether colours depend on the viewing direction.
-        absolute: whether to fill the hook's third column.
+    With ``sh_turns`` colours depend on the direction; ``absolute`` fills the hook's third column.
     """
     colour = bool(wanted & {"colors", "sh"}) or ("means" in wanted and sh_turns)
     return {
@@ -162,14 +157,7 @@ class Device(Hashable, Protocol):
 
 
 class Arena:
-    """Named arrays in one tensor, each at a multiple of 256 bytes.
-
-    Args:
-        sizes: bytes, by name.
-
-    Attributes:
-        filled: names of the arrays that have bytes.
-    """
+    """Named arrays, of these sizes in bytes, in one tensor, each at a multiple of 256 bytes."""
 
     def __init__(self, where: torch.device, fill: Callable[..., Tensor], **sizes: int) -> None:
         self.filled = {name for name, size in sizes.items() if size}
@@ -235,7 +223,6 @@ class Drawing:
     drawing. A reference back would be a cycle through C++, which no garbage collector finds.
 
     Attributes:
-        where: the device that it runs on.
         evaluated: (Gaussian, pixel) lanes that were computed; NaN until read.
         entries: (Gaussian, tile) pairs in the lists; NaN until read.
     """
@@ -267,9 +254,6 @@ class Drawing:
         Args:
             capacity: the number of list entries, over all tiles, to allocate room for.
             deterministic: give each entry its own slot, so that backward can add in order.
-
-        Returns:
-            Tensors by their names in ``RasterOutputs``.
         """
         inputs, n, where = self._inputs, self._n, self.where
         keep = bool(wanted)
@@ -308,15 +292,9 @@ class Drawing:
         return outputs | {"fragments_per_pixel": per_pixel}
 
     def _room(self, capacity: int, keep: bool, slots: bool) -> tuple[Arena, Arena, Arena]:
-        """The memory of a frame.
+        """A frame's memory: what begins with zeros, what makes the lists, and what backward reads.
 
-        Args:
-            keep: backward will come.
-            slots: each list entry has one, so that backward adds in a fixed order.
-
-        Returns:
-            Arrays that begin with zeros; those needed until the lists are made; and those that
-            backward reads.
+        With ``keep`` backward will come; with ``slots`` it adds lists' entries in a fixed order.
         """
         n, where, pixels = self._n, self.where, self._pixels
         cleared = Arena(

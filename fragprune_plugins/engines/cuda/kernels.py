@@ -1,7 +1,6 @@
 """Compiles the GPU's kernels at first use, and keeps the compiled code.
 
-The compiler is NVRTC, from torch's own wheels, through ``cuda.bindings``. Python's and torch's
-headers are not needed.
+The compiler is NVRTC, through ``cuda.bindings``. It needs no headers of Python and torch.
 """
 
 from __future__ import annotations
@@ -18,19 +17,13 @@ from filelock import FileLock, Timeout
 
 from fragprune_plugins import native
 
-ENVIRONMENT: Final = "FRAGPRUNE_CUDA"
-"""Set to off, it switches the cuda engine off."""
-
-CACHE: Final = "FRAGPRUNE_CACHE"
-"""Names a folder for compiled kernels, instead of the platform's cache folder."""
+ENVIRONMENT: Final = "FRAGPRUNE_CUDA"  # set to off, it switches the cuda engine off
+CACHE: Final = "FRAGPRUNE_CACHE"  # a folder for kernels, not the platform's
 
 SOURCES: Final = Path(native.__file__).parent / "cuda"
 
-OLDEST: Final = 70
-"""Compute capability, major times ten plus minor: warps' matching and independent lanes."""
-
-_OPTIONS: Final = ("--std=c++17", "--fmad=false")
-"""Nothing is contracted but what is spelled out: see native/cuda/numbers.cuh."""
+OLDEST: Final = 70  # major x 10 + minor: warps' matching and independent lanes
+_OPTIONS: Final = ("--std=c++17", "--fmad=false")  # no contraction: native/cuda/numbers.cuh
 
 _STDINT: Final = b"""
 typedef signed char int8_t; typedef unsigned char uint8_t;
@@ -46,12 +39,7 @@ class Unavailable(Exception):  # noqa: N818 - a state of this machine
 
 @dataclass(frozen=True)
 class Image:
-    """A compiled source.
-
-    Attributes:
-        code: machine code, or PTX that the driver compiles further.
-        log: the compiler's output, which includes resources.
-    """
+    """A compiled source: machine code, or PTX, and the compiler's output."""
 
     code: bytes
     log: str
@@ -139,11 +127,7 @@ def compiler() -> Nvrtc:
 
 
 def target_of(capability: int, architectures: tuple[int, ...]) -> str:
-    """The compile target: machine code if the toolkit knows the GPU, else PTX for an older one.
-
-    Args:
-        capability: of the GPU, major times ten plus minor.
-    """
+    """The target of a capability, major x 10 + minor: machine code, or PTX for an older one."""
     if capability in architectures:
         return f"sm_{capability}"
     if not (older := [code for code in architectures if code <= capability]):
@@ -179,17 +163,10 @@ def digest_of_sources() -> bytes:
 
 
 def image_of(source: str, macros: dict[str, int], target: str, by: Nvrtc) -> tuple[Image, bool]:
-    """A compiled source, and whether it was in the cache.
+    """A compiled source of native/cuda, and whether it was in the cache, or Unavailable.
 
     Processes that need the same source at the same time wait for the first of them. If the folder
     cannot be written, nothing is kept.
-
-    Args:
-        source: a name in native/cuda, without .cu.
-        target: sm_90 for machine code, compute_90 for PTX.
-
-    Raises:
-        Unavailable: the source does not compile.
     """
     what = repr((by.name, by.version, _OPTIONS, source, sorted(macros.items()), target))
     digest = hashlib.sha256(digest_of_sources() + what.encode()).hexdigest()[:24]

@@ -1,8 +1,7 @@
 """Decides whether the cuda engine may be used on a GPU, by comparing it with other engines.
 
-The comparison runs in its own process: a kernel with an invalid read breaks the GPU for its whole
-process, and a kernel that waits forever does not return. The verdict is stored beside the compiled
-kernels.
+It compares in a process of its own: an invalid read breaks the GPU for its whole process, and a
+kernel may wait forever. The verdict is stored beside the compiled kernels.
 """
 
 from __future__ import annotations
@@ -22,14 +21,9 @@ import torch
 from fragprune_plugins.engines.cuda import driver, kernels
 from fragprune_plugins.errors import log
 
-PATIENCE: Final = 300
-"""Seconds that a check may take; mostly for compiling, once."""
-
-BEGUN: Final = "begun"
-"""Said once there is a context and memory: what goes wrong later is the kernels' doing."""
-
-FAILS, COULD_NOT_RUN = 3, 4
-"""Exit codes of the check's process, ``engines.cuda.comparison``."""
+PATIENCE: Final = 300  # seconds that a check may take; mostly for compiling, once
+BEGUN: Final = "begun"  # there is a context and memory: from here on faults are the kernels'
+FAILS, COULD_NOT_RUN = 3, 4  # exit codes of the check's process, ``engines.cuda.comparison``
 
 _OWN = b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
 """What calls the kernels and compares them: once it is mended, the check is made anew."""
@@ -37,13 +31,9 @@ _OWN = b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob(
 
 @dataclass(frozen=True)
 class Verdict:
-    """The result of a check.
+    """The result of a check."""
 
-    Attributes:
-        outcome: "fails" when the engine draws something else, crashes or never returns; "could not
-            run" when the GPU had no room, no time or no kernels for the check.
-    """
-
+    # "fails" for another picture, a crash, no end; "could not run" for no room, time or kernels
     outcome: Literal["agrees", "fails", "could not run"]
     reason: str = ""
 
