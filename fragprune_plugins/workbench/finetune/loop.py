@@ -137,10 +137,9 @@ class Training:
             target=target,
             everywhere=processes.everywhere,
         )
-        lively = relocate is not None or bool(settings.dropout and not settings.itself)
-        rates, self.relocation = rates_of(settings, dataset.extent, lively=lively), None
+        self.relocation = None
+        rates = rates_of(settings, dataset.extent, moves=relocate is not None)
         if relocate is not None:
-            rates["xyz"] *= POSITIONS
             self.relocation = Relocation(relocate, len(start), settings.iterations)
             if isinstance(pressure := self.stage.pressure, ElasticPressure):
                 pressure.elasticity *= DEEPER
@@ -357,15 +356,16 @@ class Training:
         return drawn_by(self.engine, replace(inputs, stop=None), None)
 
 
-def rates_of(settings: Settings, extent: float, *, lively: bool) -> dict[str, float]:
+def rates_of(settings: Settings, extent: float, *, moves: bool) -> dict[str, float]:
     """Initial learning rates of the parameters that train, by name, in steps of one view."""
     rates = {"opacity": settings.opacity_lr}
     if settings.train in ("appearance", "all"):
         rates |= _APPEARANCE
     if settings.train == "all":
         rates |= _GEOMETRY | {"xyz": _GEOMETRY["xyz"] * extent}
-    if lively and settings.train == "all":
-        rates |= {name: _LIVELY * rate for name, rate in rates.items() if name != "opacity"}
+    if moves or (settings.dropout and settings.train == "all" and not settings.itself):
+        lively = {name: _LIVELY * rate for name, rate in rates.items() if name != "opacity"}
+        rates |= lively | ({"xyz": POSITIONS * rates["xyz"]} if moves else {})
     return rates
 
 
