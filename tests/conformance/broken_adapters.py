@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -131,8 +131,14 @@ class FitsEverything(Vanilla3DGS):
         return Match(self.name, True)
 
 
-@dataclass(frozen=True)
-class Glowing(GraphdecoDialect):
+def drawing(dialect: type[GraphdecoDialect]) -> type[Vanilla3DGS]:
+    """The adapter whose host is drawn so."""
+    members = {"dialect_type": dialect, "__module__": __name__}
+    return type(dialect.__name__, (Vanilla3DGS,), members)
+
+
+@drawing
+class LeavesATrace(GraphdecoDialect):
     """Every Gaussian lights up all that is drawn, drawn or not."""
 
     def pack(self, outputs: Any, call: Any) -> Any:
@@ -141,15 +147,9 @@ class Glowing(GraphdecoDialect):
         return image + call["opacities"].mean() * drawn, *rest
 
 
-class LeavesATrace(Vanilla3DGS):
-    """Its picture depends on what was truncated."""
-
-    def dialect(self, repo: Any) -> Glowing:
-        return Glowing(**vars(super().dialect(repo)))
-
-
-class Wavering(GraphdecoDialect):
-    """Another dilation for every call."""
+@drawing
+class DrawsOtherwiseEachTime(GraphdecoDialect):
+    """No two pictures agree, whatever draws them: another dilation for every call."""
 
     calls = [0]  # noqa: RUF012 - counts through all instances
 
@@ -158,8 +158,8 @@ class Wavering(GraphdecoDialect):
         return replace(super().unpack(call), dilation=0.3 + 0.05 * self.calls[0])
 
 
-@dataclass(frozen=True)
-class Black(GraphdecoDialect):
+@drawing
+class ForgetsTheBackground(GraphdecoDialect):
     """Draws over black, whatever was asked for."""
 
     def unpack(self, call: Any) -> Any:
@@ -167,29 +167,10 @@ class Black(GraphdecoDialect):
         return replace(inputs, view=replace(inputs.view, background=torch.zeros(3)))
 
 
-class ForgetsTheBackground(Vanilla3DGS):
-    """Draws over black, whatever was asked for."""
-
-    def dialect(self, repo: Any) -> Black:
-        return Black(**vars(super().dialect(repo)))
-
-
-@dataclass(frozen=True)
-class Radiusless(GraphdecoDialect):
+@drawing
+class GivesNoRadii(GraphdecoDialect):
     def pack(self, outputs: Any, call: Any) -> Any:
         return super().pack(replace(outputs, radii=torch.zeros_like(outputs.radii)), call)
-
-
-class GivesNoRadii(Vanilla3DGS):
-    def dialect(self, repo: Any) -> Radiusless:
-        return Radiusless(**vars(super().dialect(repo)))
-
-
-class DrawsOtherwiseEachTime(Vanilla3DGS):
-    """No two pictures agree, whatever draws them."""
-
-    def dialect(self, repo: Any) -> Wavering:
-        return Wavering(**vars(super().dialect(repo)))
 
 
 class HoldsStepsBack(GaussianSplatting):

@@ -119,14 +119,6 @@ def skips():
     raise NotApplicable("nothing here")
 
 
-def dies():
-    os._exit(3)
-
-
-def lingers():
-    time.sleep(60)
-
-
 def test_what_a_fresh_process_does_comes_back():
     assert fresh(os.path.join, "a", "b") == "a/b"
     assert fresh(os.getpid) != fresh(os.getpid) != os.getpid()
@@ -135,9 +127,9 @@ def test_what_a_fresh_process_does_comes_back():
     with pytest.raises(NotApplicable, match="nothing here"):
         fresh(skips)
     with pytest.raises(FreshProcessError, match="exit code 3"):
-        fresh(dies)
+        fresh(os._exit, 3)
     with pytest.raises(FreshProcessError, match=r"longer than 0\.1 seconds"):
-        fresh(lingers, seconds=0.1)
+        fresh(time.sleep, 60, seconds=0.1)
 
 
 def test_the_table_has_adapters_down_and_invariants_across():

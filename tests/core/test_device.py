@@ -48,8 +48,12 @@ def test_cuda_methods_return_the_tensor_itself_as_on_a_gpu_they_would():
     assert module.weight.device.type == "cpu"
 
 
-def test_numbers_that_are_no_device_and_flags_stay_what_they_are():
+def test_what_only_looks_like_a_device_stays_what_it_is():
+    """Numbers, flags and words."""
+    assert redirection._redirected("cudaX") == "cudaX"
     with cpu_only():
+        assert torch.nn.functional.pad(torch.ones(1, 2), (1, 1), mode="reflect").shape == (1, 4)
+        assert torch.einsum("i,i->", torch.ones(2), torch.ones(2)) == 2
         assert torch.arange(3).sum(0) == 3
         assert torch.ones(2).to(torch.float64, True).dtype == torch.float64
         assert torch.nn.Linear(2, 2).to(torch.float64, True).weight.dtype == torch.float64
@@ -84,14 +88,6 @@ def test_a_tensors_device_can_be_handed_on():
     """Outside, its number is -1, and no tensor goes there."""
     with cpu_only():
         assert torch.ones(2).to(torch.zeros(1).get_device()).sum() == 2
-
-
-def test_values_that_only_look_like_devices_are_left_alone():
-    with cpu_only():
-        assert torch.nn.functional.pad(torch.ones(1, 2), (1, 1), mode="reflect").shape == (1, 4)
-        assert torch.einsum("i,i->", torch.ones(2), torch.ones(2)) == 2
-    assert redirection._redirected("cudaX") == "cudaX"
-    assert redirection._redirected("cpu") == "cpu"
 
 
 def test_events_measure_and_calls_without_a_meaning_do_nothing():

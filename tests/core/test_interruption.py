@@ -44,11 +44,17 @@ def test_the_handler_before_is_back_however_it_ended():
     assert signal.getsignal(signal.SIGTERM) is own
 
 
-def test_who_has_it_ignored_is_left_alone():
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    with sigterm_interrupts():
-        signal.raise_signal(signal.SIGTERM)
-        assert signal.getsignal(signal.SIGTERM) is signal.SIG_IGN
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_who_has_it_ignored_is_left_alone(number):
+    """As a closed terminal's under nohup."""
+    before = signal.signal(number, signal.SIG_IGN)
+    try:
+        with sigterm_interrupts():
+            signal.raise_signal(number)
+            assert signal.getsignal(number) is signal.SIG_IGN
+        assert signal.getsignal(number) is signal.SIG_IGN
+    finally:
+        signal.signal(number, before)
 
 
 CLOSED = """
@@ -79,17 +85,6 @@ def test_what_was_learned_is_saved_when_the_terminal_is_closed(tmp_path):
     os.close(terminal)
     _, status = os.waitpid(process, 0)
     assert (os.waitstatus_to_exitcode(status), saved.exists()) == (0, True)
-
-
-def test_who_has_a_closed_terminal_ignored_is_left_alone():
-    """As under nohup."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
-        with sigterm_interrupts():
-            signal.raise_signal(signal.SIGHUP)
-        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
-    finally:
-        signal.signal(signal.SIGHUP, before)
 
 
 def test_where_no_terminal_hangs_up_there_is_sigterm_alone(monkeypatch):

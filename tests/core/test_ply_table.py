@@ -28,27 +28,24 @@ def binary(rows, order="<"):
     return rows.astype(order + "f8").tobytes()
 
 
+BEFORE = [b"element extra 2", b"property uchar a", b"property short b", b"property float c"]
+
+
 @pytest.mark.parametrize(
-    ("kind", "order"), [(b"binary_little_endian", "<"), (b"binary_big_endian", ">")]
+    ("kind", "body", "before"),
+    [
+        (b"binary_little_endian", b"z" * 14 + binary(ROWS, "<"), BEFORE),
+        (b"binary_big_endian", b"z" * 14 + binary(ROWS, ">"), BEFORE),
+        (b"ascii", b"9 9 9 9 9 9\n1 2\n3 4\n5 6\n", BEFORE),
+        (b"ascii", b"1 2 3 4 5 6", []),  # text may end with its last digit
+    ],
 )
-def test_elements_before_are_skipped_by_their_size(tmp_path, kind, order):
-    before = [b"element extra 2", b"property uchar a", b"property short b", b"property float c"]
-    columns, reading = table(tmp_path / "a", kind, b"z" * 14 + binary(ROWS, order), *before)
+def test_elements_before_are_skipped_by_their_size(tmp_path, kind, body, before):
+    columns, reading = table(tmp_path / "a", kind, body, *before)
     assert list(columns) == ["x", "y"]
     assert np.array_equal(np.stack(list(columns.values()), axis=1), ROWS)
+    assert columns["x"].dtype.newbyteorder("=") == np.float64
     assert reading.place == ""
-
-
-def test_text_may_end_with_its_last_digit(tmp_path):
-    columns, _ = table(tmp_path / "a", b"ascii", b"1 2 3 4 5 6")
-    assert np.array_equal(np.stack(list(columns.values()), axis=1), ROWS)
-    assert columns["x"].dtype == np.float64
-
-
-def test_numbers_of_elements_before_are_skipped_in_text(tmp_path):
-    before = [b"element extra 3", b"property uchar a", b"property uchar b"]
-    columns, _ = table(tmp_path / "a", b"ascii", b"9 9 9 9 9 9\n1 2\n3 4\n5 6\n", *before)
-    assert np.array_equal(np.stack(list(columns.values()), axis=1), ROWS)
 
 
 @pytest.mark.parametrize(
