@@ -118,21 +118,17 @@ def test_a_splat_is_drawn_beyond_three_sigma_inside_its_tiles_and_nowhere_outsid
     assert columns_reached(16.9) == list(range(1, 32))
 
 
-def test_a_pixel_stops_before_the_fragment_that_would_darken_it_too_much():
-    # 0.1^3 = 1e-3; times 0.05 is under 1e-4: the fourth is not blended, nor is the fifth, though
-    # alone the fifth would leave enough light.
-    inputs = scenes.stack([0.9, 0.9, 0.9, 0.95, 0.5], dtype=F64)
-    drawn = draw(inputs)
-    assert drawn.fragments[8, 8] == 3
-    assert drawn.alpha[0, 8, 8].item() == pytest.approx(1 - 1e-3)
-    first_three = replace(inputs, splats=gaussians_first(inputs.splats, 3))
-    assert torch.equal(draw(first_three).image[:, 8, 8], drawn.image[:, 8, 8])
-
-
-def test_a_pixel_goes_on_while_enough_light_is_left():
-    drawn = draw(scenes.stack([0.9, 0.9, 0.9, 0.89], dtype=F64))
-    assert drawn.fragments[8, 8] == 4
-    assert drawn.alpha[0, 8, 8].item() == pytest.approx(1 - 1.1e-4)
+@pytest.mark.parametrize(
+    ("fourth", "drawn", "left"), [(0.95, 3, 1e-3), (0.89, 4, 1.1e-4)], ids=["stops", "goes on"]
+)
+def test_a_pixel_stops_before_the_fragment_that_would_darken_it_too_much(fourth, drawn, left):
+    """0.1^3 times 0.05 is under 1e-4: there nothing is blended, nor behind, though it would do."""
+    inputs = scenes.stack([0.9, 0.9, 0.9, fourth, 0.5], dtype=F64)
+    found = draw(inputs)
+    assert found.fragments[8, 8] == drawn
+    assert found.alpha[0, 8, 8].item() == pytest.approx(1 - left)
+    blended = replace(inputs, splats=gaussians_first(inputs.splats, drawn))
+    assert torch.equal(draw(blended).image[:, 8, 8], found.image[:, 8, 8])
 
 
 @pytest.mark.parametrize(
