@@ -34,7 +34,6 @@ def main() -> int:
     every = Tally()
     readers = [BY_NAME[name] for name in words.readers or BY_NAME if name in BY_NAME]
     for reader in [*readers, *(COMMANDS if "commands" in words.readers else ())]:
-        reader.pool()  # a scene is made once, for all children
         tally = run(reader, words.inputs, seed=words.seed, seconds=words.seconds)
         print(row(reader.name, tally), flush=True)
         every.outcomes += tally.outcomes

@@ -1,5 +1,6 @@
 """Every reader as a function of bytes: what it gives is looked at, what it raises is judged."""
 
+import io
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -68,7 +69,7 @@ def _format(suffix: str) -> Callable[[Path], None]:
 
 def _sog_beside(file: Path) -> None:
     """``meta.json`` of a SOG; the images beside it are good."""
-    with zipfile.ZipFile(next((seeds.CORPUS / "sog").glob("degree1.*"))) as archive:
+    with zipfile.ZipFile(io.BytesIO(seeds.good()["sog"]["degree1.sog"])) as archive:
         archive.extractall(file.parent)
     _ply(file.replace(file.with_name("meta.json")))
 
@@ -115,8 +116,7 @@ def _colmap(name: str) -> Callable[[Path], None]:
     def read(file: Path) -> None:
         sparse = file.parent / "sparse"
         sparse.mkdir(exist_ok=True)
-        good = next((seeds.CORPUS / partner).glob("a.*"))
-        (sparse / partner).write_bytes(good.read_bytes())
+        (sparse / partner).write_bytes(seeds.good()[partner][f"a.{kind}"])
         file.replace(sparse / name)
         for part in colmap.read(file.parent):
             for row in part:
@@ -144,7 +144,8 @@ def _image(file: Path) -> None:
 
 
 def _mask(file: Path) -> None:
-    good = next((seeds.CORPUS / "image").glob("a.png"))
+    good = file.with_name("good.png")
+    good.write_bytes(seeds.good()["image"]["a.png"])
     picture = Photograph("a", _view(), good, mask=file).image
     _sound("a picture of another size", picture.shape == (3, tiny.SIDE, tiny.SIDE))
 
@@ -206,13 +207,18 @@ def _arguments(file: Path) -> None:
 
 @dataclass(frozen=True)
 class Reader:
-    """Its name is also the folder of its seeds; it raises Nonsense for what nobody can use."""
+    """Its name is also that of its seeds; it raises Nonsense for what nobody can use."""
 
     name: str
     read: Callable[[Path], None]
 
     def pool(self) -> list[bytes]:
-        return [path.read_bytes() for path in sorted((seeds.CORPUS / self.name).iterdir())]
+        return [*seeds.good()[self.name].values(), *self.found().values()]
+
+    def found(self) -> dict[str, bytes]:
+        """By name what broke it once."""
+        files = sorted((seeds.CORPUS / self.name).glob("found-*"))
+        return {path.name: path.read_bytes() for path in files}
 
 
 READERS = [

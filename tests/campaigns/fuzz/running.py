@@ -101,6 +101,7 @@ def broken(name: str, pool: list[bytes], seed: int, number: int) -> bytes:
 def run(reader: Reader, count: int, *, seed: int = 0, seconds: float = 1e9) -> Tally:
     """Feed up to ``count`` inputs to a reader, for up to so many seconds in all."""
     tally, first, end = Tally(), 0, time.monotonic() + seconds
+    reader.pool()  # made once, for all children
     memory = "/dev/shm" if os.path.isdir("/dev/shm") else None
     with tempfile.TemporaryDirectory(prefix="fuzz-", dir=memory) as folder:
         while first < count and time.monotonic() < end:

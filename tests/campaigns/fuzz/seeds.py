@@ -1,8 +1,4 @@
-"""Makes the corpus, small good files of every kind: ``python -m campaigns.fuzz.seeds``.
-
-All of it is our own, made from numbers. Files named ``found-*`` are inputs that once broke a
-reader; nothing here makes or removes them.
-"""
+"""Small good files of every kind, made from numbers, and the inputs that once broke a reader."""
 
 import gzip
 import io
@@ -10,6 +6,7 @@ import json
 import struct
 import tempfile
 import zipfile
+from functools import cache
 from itertools import chain
 from pathlib import Path
 
@@ -28,6 +25,7 @@ from fragprune_plugins.workbench.models.formats.ply import write_ply
 from fragprune_plugins.workbench.models.formats.spz import zstd
 
 CORPUS = Path(__file__).parent / "corpus"
+"""Of what was found, in a folder for each reader."""
 
 _RENDERER = b"""import math
 
@@ -222,9 +220,11 @@ def _camera_path() -> bytes:
     return json.dumps({"camera_path": path, "render_width": 32, "render_height": 32}).encode()
 
 
-def make() -> dict[str, dict[str, bytes]]:
-    """Seeds by reader and name."""
-    with tempfile.TemporaryDirectory() as name:
+@cache
+def good() -> dict[str, dict[str, bytes]]:
+    """Files by reader and name; the same whenever they are made."""
+    with tempfile.TemporaryDirectory() as name, torch.random.fork_rng():
+        torch.manual_seed(0)
         folder = Path(name)
         binary, text = _scene(folder, binary=True), _scene(folder, binary=False)
         return {
@@ -264,21 +264,3 @@ def make() -> dict[str, dict[str, bytes]]:
             "config": {"a.json": b'{"iterations": 30000, "source_path": "scene", "lambda": 0.2}'},
             "cfg_args": {"a.txt": _ARGUMENTS},
         }
-
-
-def main() -> None:
-    """Write the corpus anew, and keep what was found."""
-    torch.manual_seed(0)
-    for reader, files in make().items():
-        folder = CORPUS / reader
-        for old in folder.glob("*") if folder.exists() else ():
-            if not old.name.startswith("found-"):
-                old.unlink()
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, content in files.items():
-            (folder / name).write_bytes(content)
-    print(f"{sum(1 for _ in CORPUS.rglob('*.*'))} files in {CORPUS}")
-
-
-if __name__ == "__main__":
-    main()
