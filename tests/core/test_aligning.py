@@ -17,11 +17,6 @@ def session():
     return state(freeze=False)
 
 
-@pytest.fixture
-def frozen():
-    return state(freeze=True)
-
-
 def told(session):
     return [
         (about["change"].operation, about["change"].before, about["change"].after)
@@ -120,7 +115,8 @@ def test_an_operation_whose_rows_nobody_traced_is_refused(session):
 
 
 @pytest.mark.parametrize("role", [Role.REARRANGE, Role.STILL])
-def test_a_frozen_model_stands_still(frozen, role):
+def test_a_frozen_model_stands_still(role):
+    frozen = state(freeze=True)
     model, known = follow(frozen)
     ran = []
     seam = call(model, role, ran.append, torch.ones(6, dtype=torch.bool), how=lambda _: "instead")

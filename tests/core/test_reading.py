@@ -274,13 +274,6 @@ def write_cameras(path, **changed):
     return path
 
 
-def write_transforms(path, matrix, **changed):
-    content = {"camera_angle_x": 0.8, "w": 32, "h": 32}
-    frames = [{"file_path": "a", "transform_matrix": matrix}]
-    path.write_text(json.dumps(content | {"frames": frames} | changed))
-    return path
-
-
 @pytest.mark.parametrize(
     ("name", "value"), [(name, each) for name, wrong in GEOMETRY.items() for each in wrong]
 )
@@ -308,8 +301,11 @@ def test_a_camera_that_is_none_is_refused_with_its_place(tmp_path, name, value):
     ],
 )
 def test_transforms_that_are_none_are_refused(tmp_path, matrix, changed):
+    frames = [{"file_path": "a", "transform_matrix": matrix}]
+    content = {"camera_angle_x": 0.8, "w": 32, "h": 32, "frames": frames} | changed
+    (tmp_path / "transforms_train.json").write_text(json.dumps(content))
     with pytest.raises(DatasetError):
-        load_cameras(write_transforms(tmp_path / "transforms_train.json", matrix, **changed))
+        load_cameras(tmp_path / "transforms_train.json")
 
 
 @pytest.mark.parametrize("rounded", [6, 3])

@@ -16,16 +16,6 @@ from fragprune_plugins.injection.rasterizing import SCALER, on_metric
 from fragprune_plugins.injection.session import active_session
 
 
-@pytest.fixture
-def stepped():
-    """A host after two steps, its model, and what observers were told."""
-    with joint(Settings(iterations=2)) as host:
-        model, camera = host.model(), host.camera()
-        for iteration in (1, 2):
-            host.step(model, camera, iteration)
-        yield host, model
-
-
 def test_after_it_an_optimizer_has_no_hook_of_ours():
     with joint() as host:
         model = host.model()
@@ -63,25 +53,27 @@ def test_steps_are_no_fault_if_a_view_was_drawn_or_none_had_to_be(steps, viewed,
         host.session.expect_drawn()
 
 
-def test_what_was_learned_is_saved_at_the_iteration_that_the_host_reached(stepped, monkeypatch):
-    host, model = stepped
-    session, saved = host.session, []
+def test_what_was_learned_is_saved_at_the_iteration_that_the_host_reached(monkeypatch):
+    saved = []
 
     def save(*words):
         saved.append(words)
         return Path("there")
 
-    monkeypatch.setattr(session.adapter, "save_model", save)
-    monkeypatch.setattr(session, "output", None)
-    assert session.save_learned() is None
-    monkeypatch.setattr(session, "output", Path("out"))
-    monkeypatch.setattr(session, "start", 20)
-    assert session.save_learned() == Path("there")
-    assert saved == [(model, Path("out"), 22)]
-    monkeypatch.setattr(session, "last", None)
-    assert session.save_learned() is None
-    monkeypatch.setattr(session, "last", lambda: None)  # the host dropped it
-    assert session.save_learned() is None
+    with joint(Settings(iterations=2)) as host:
+        model, camera, session = host.model(), host.camera(), host.session
+        for iteration in (1, 2):
+            host.step(model, camera, iteration)
+        monkeypatch.setattr(session.adapter, "save_model", save)
+        monkeypatch.setattr(session, "output", None)
+        assert session.save_learned() is None
+        monkeypatch.setattr(session, "output", Path("out"))
+        monkeypatch.setattr(session, "start", 20)
+        assert session.save_learned() == Path("there")
+        assert saved == [(model, Path("out"), 22)]
+        for last in (None, lambda: None):  # or the host dropped it
+            monkeypatch.setattr(session, "last", last)
+            assert session.save_learned() is None
 
 
 @pytest.mark.parametrize(

@@ -23,13 +23,11 @@ def disc(x: float, y: float, sigma: float, opacity: float = 0.5) -> Footprints:
     )
 
 
-def view() -> View:
-    return View.pinhole(torch.eye(3), torch.zeros(3), width=SIDE, height=SIDE, fx=50.0, fy=50.0)
-
-
 def entries(splats: Footprints, threshold: float | None = None) -> float:
     cut = None if threshold is None else torch.full((len(splats),), threshold)
-    drawn = CpuEngine().rasterize(RasterInputs(view(), splats), cut)
+    size = {"width": SIDE, "height": SIDE}
+    view = View.pinhole(torch.eye(3), torch.zeros(3), **size, fx=50.0, fy=50.0)
+    drawn = CpuEngine().rasterize(RasterInputs(view, splats), cut)
     return drawn.entries_per_pixel * SIDE**2
 
 
