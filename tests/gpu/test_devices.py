@@ -9,10 +9,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from cli.commands import run_json
+from cli.commands import drawing, run_json
 from finetune import tiny
 
 from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.testing.host import MINIATURE
 from fragprune_plugins.workbench.models.formats.ply import write_ply
 
@@ -95,6 +96,45 @@ def test_a_model_learns_there_as_on_the_cpu(python, scene, tmp_path, monkeypatch
     assert (found["engine"], here["engine"]) == ("cuda", "cpu")
     for figure in ("psnr", "fragments_per_pixel", "ssim"):
         assert found[figure] == pytest.approx(here[figure], rel=1e-3)
+
+
+COMMANDS = """
+import json
+import sys
+from unittest import mock
+from cli.commands import run_json
+from fragprune_plugins.engines.cuda.engine import CudaEngine
+
+draw, frames = CudaEngine.rasterize, []
+
+def drawn(engine, inputs, thresholds):
+    given = vars(inputs.view) | vars(inputs.splats) | {"thresholds": thresholds}
+    frames.append([name for name, each in given.items() if not getattr(each, "is_cuda", True)])
+    return draw(engine, inputs, thresholds)
+
+with pretended.a_gpu(), mock.patch.object(CudaEngine, "rasterize", drawn):
+    for words in json.loads(sys.argv[2]):
+        frames.clear()
+        report = run_json(*words)
+        row = report["results"][0] if "results" in report else report
+        row = row if "device" in row else row.get("columns", {}).get("truncated", row)
+        told = words[0] in ("finetune", "render", "profile", "bench")
+        assert frames and not any(frames), frames  # nothing lay elsewhere
+        assert not told or row["engine"] == row["device"][:4] == "cuda", report
+"""
+
+
+def test_every_command_draws_there(python, scene, tmp_path):
+    path, out = tmp_path / "cut.ply", tmp_path / "out"
+    write_ply(path, tiny.cut(read_ply(tmp_path / "model.ply"), 0.3))
+    cameras = tiny.write_path(tmp_path / "path.json", ["a", "b"])
+    words = [[name, *given] for name, given in drawing(scene, path, cameras, out).items()]
+    words += [
+        ["render", path, "--cameras", cameras, "--out", out],
+        ["report", out, "--data", scene],
+    ]
+    words += [["bench", "--size", "24x16", "--gaussians", 40]]
+    python(COMMANDS, json.dumps(words, default=str), where=tmp_path)
 
 
 def test_a_host_trains_and_is_pruned_there(python, scene, tmp_path):
