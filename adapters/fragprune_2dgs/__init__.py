@@ -7,14 +7,17 @@ which the host regularises.
 
 from __future__ import annotations
 
+import ast
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import fragprune_graphdeco as graphdeco
-from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
+from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall, every, text_of
 from fragprune_plugins.adapting import (
+    Finding,
     HostCall,
     HostInfo,
+    HostRepo,
     InputError,
     RasterInputs,
     RasterOutputs,
@@ -25,6 +28,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 PACKAGE = "diff_surfel_rasterization"
+RENDERER, MAPS = "gaussian_renderer", 7
 
 
 @dataclass(frozen=True)
@@ -77,3 +81,14 @@ class SurfelSplatting(GraphdecoAdapter):
     own_names = ("utils.point_utils:depth_to_normal", "gaussian_renderer:allmap")
     dialect_type = SurfelDialect
     seams = revised(GraphdecoAdapter.seams, {"GaussianRasterizer.forward": {"module": PACKAGE}})
+
+    def fingerprint(self, repo: HostRepo) -> list[Finding]:
+        """Likewise, and an error for a drawing that reads further maps, which nobody draws here."""
+        found, drawing = super().fingerprint(repo), repo.function(RENDERER, "render")
+        for each in every(drawing, ast.Subscript):
+            ends = [getattr(n, "value", 0) for n in every(each.slice, ast.Constant)]
+            if text_of(each.value) == "allmap" and max(ends, default=0) > MAPS:
+                at = f"{RENDERER}:render ({repo.at(RENDERER, each.lineno)})"
+                what = f"reads {text_of(each)}"
+                found.append(Finding.error("rasterizer-call", at, what, f"a stack of {MAPS} maps"))
+        return found

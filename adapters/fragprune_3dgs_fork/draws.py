@@ -176,11 +176,8 @@ def _output(fork: Fork, draw: Draw, call: graphdeco.CallInSource, number: int) -
         fork.warn("rasterizer-output", at, f"what {package} returns as {name}")
         return Output(name, "unproved")
     if uses and fork.early.issuperset(uses):
-        fork.warn(
-            "rasterizer-output",
-            at,
-            f"{name}, by which it densifies and which only its own rasterizer gives",
-        )
+        found = f"{name}, by which it densifies and which only its own rasterizer gives"
+        fork.warn("rasterizer-output", at, found)
     elif uses:
         places = [place for node, place in uses.items() if node not in fork.early]
         found = f"{name}, read in {places[0]}, whose meaning is unknown"

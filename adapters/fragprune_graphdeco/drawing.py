@@ -245,6 +245,10 @@ class Drawing:
         """What an expression is made of: "model.x", parameters, and "model" itself."""
         if node is None:
             return
+        if re.match(r"getattr\(\w+, '", text_of(node)):  # the attribute, and what it is without
+            of, name, *others = node.args  # type: ignore[attr-defined]
+            yield from (root for each in others for root in self._roots(each))
+            node = ast.Attribute(of, name.value)
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
             if self.made.get(node.value.id) == (self.model,):
                 yield from (f"{self.model}.{each}" for each in self._given_by(node.attr))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import builtins
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -60,6 +61,7 @@ def reasons(repo: HostRepo, scripts: tuple[str, ...]) -> tuple[str, ...]:
             if any("torch.compile" in text_of(each) for each in node.decorator_list):
                 found.append(f"{script} compiles {node.name}, which trains")
         found += [*_broken(repo, module)][:1]
+        found += [*_unbound(repo, module)][:1]
         found += (*_misfits(repo, module), *_absent(repo, module), *_own_options(repo, module))[:1]
         found += [f"{script} draws by {each}" for each in _drawn_elsewhere(repo, module)][:1]
     return tuple(found)
@@ -152,7 +154,65 @@ def _misfits(repo: HostRepo, module: str) -> tuple[str, ...]:
     that the model lacks; without those that a script tries, or makes only where something is
     given or asked for.
     """
-    tree, misfits = repo.tree(module), tuple[str, ...]()
+    tree, misfits, gone = repo.tree(module), tuple[str, ...](), _perhaps(repo, module)
+    calls = [each for each in every(tree, ast.Call) if each not in gone]
+    called, texts = dict[str, set[str]](), text_of(tree) + text_of(repo.tree(MODEL))
+    for to, value in assigned(tree):
+        called.setdefault(text_of(to), set()).add(text_of(getattr(value, "func", None)))
+    unpacked = {value: to for to, value in assigned(tree) if isinstance(to, ast.Tuple)}
+    for node in sorted(calls, key=lambda each: (each.lineno, each.col_offset)):
+        owner, _, name = text_of(node.func).rpartition(".")
+        if name in ("capture", "restore"):
+            continue
+        of, *others = called.get(owner, {""}) if owner else {name}
+        if others or not (owner or _bindings(tree)[name] == 1):
+            of = ""  # a name of several things
+        at = repo.at(module, node.lineno)
+        home, found = definition_of(repo, MODEL if of == "GaussianModel" else module, of)
+        model = found if owner else None
+        if owner:
+            body = model.body if isinstance(model, ast.ClassDef) else []
+            found = next((each for each in body if getattr(each, "name", "") == name), None)
+            inherits = "setattr(" in texts or f".{name} = " in texts
+            lacks = isinstance(model, ast.ClassDef) and not (found or model.bases or inherits)
+            if lacks and of == "GaussianModel":
+                misfits += (f"calls {name}, which its model lacks ({at})",)
+        if why := _misfit(found, node, bool(owner)):
+            misfits += (f"its call of {name} {why}, which fails ({at})",)
+        taken, given = unpacked.get(node), _lengths(repo, home, model, found)
+        if taken and given and not every(taken, ast.Starred) and len(taken.elts) not in given:
+            what = f"takes {len(taken.elts)} values of {name}, which gives {min(given)}"
+            misfits += (f"{what} ({at})",)
+    return misfits
+
+
+def _lengths(
+    repo: HostRepo, module: str, owner: ast.AST | None, function: ast.AST | None
+) -> set[int]:
+    """How many values a function of a module, or a method of a class in it, may return, also by a
+    network of that class; empty if that is unknown.
+    """
+    plain = isinstance(function, ast.FunctionDef) and not function.decorator_list
+    body = nodes(function if plain and not every(function, ast.Yield) else None)
+    found = set[int]()
+    inner = {n for f in body[1:] if isinstance(f, ast.FunctionDef) for n in nodes(f)}
+    for value in (n.value for n in body if isinstance(n, ast.Return) and n not in inner):
+        lengths = {len(value.elts)} if isinstance(value, ast.Tuple) else set[int]()
+        asked = text_of(value.func) if isinstance(value, ast.Call) else ""
+        for made in (made for to, made in assigned(owner) if text_of(to) == asked):
+            home, net = definition_of(repo, module, next((n.id for n in every(made, ast.Name)), ""))
+            forward = (n for n in nodes(net) if getattr(n, "name", "") == "forward")
+            lengths |= _lengths(repo, home, None, next(forward, None))
+        if not lengths or every(value, ast.Starred):
+            return set()
+        found |= lengths
+    return found
+
+
+@lru_cache(maxsize=64)
+def _perhaps(repo: HostRepo, module: str) -> frozenset[ast.AST]:
+    """What a script tries, does only where something is given or asked for, or does not do."""
+    tree = repo.tree(module)
     asked = [
         each
         for each in every(tree, ast.If)
@@ -160,28 +220,21 @@ def _misfits(repo: HostRepo, module: str) -> tuple[str, ...]:
     ]
     parts = [*(each.body for each in asked), *(each.body for each in every(tree, ast.Try))]
     tried = {inner for part in parts for each in part for inner in nodes(each)}
-    model = definition_of(repo, MODEL, "GaussianModel")[1]
-    pairs = [(text_of(to), text_of(value)) for to, value in assigned(tree)]
-    models = {to for to, value in pairs if value.startswith("GaussianModel(")}
-    models -= {to for to, value in pairs if not value.startswith("GaussianModel(")}
-    gone = tried | skipped(tree, as_options(repo, ("arguments", module))).keys()
-    texts = text_of(tree) + text_of(model)
-    calls = [each for each in every(tree, ast.Call) if each not in gone]
-    for node in sorted(calls, key=lambda each: (each.lineno, each.col_offset)):
-        owner, _, name = text_of(node.func).rpartition(".")
-        found, at = None, repo.at(module, node.lineno)
-        if name in ("capture", "restore"):
-            continue
-        if owner in models and isinstance(model, ast.ClassDef):
-            found = next((n for n in model.body if getattr(n, "name", "") == name), None)
-            inherits = model.bases or "setattr(" in texts or f".{name} = " in texts
-            if found is None and not inherits:
-                misfits += (f"calls {name}, which its model lacks ({at})",)
-        elif not owner and _bindings(tree)[name] == 1:
-            found = model if name == "GaussianModel" else definition_of(repo, module, name)[1]
-        if why := _misfit(found, node, bool(owner)):
-            misfits += (f"its call of {name} {why}, which fails ({at})",)
-    return misfits
+    return frozenset(tried | skipped(tree, as_options(repo, ("arguments", module))).keys())
+
+
+def _unbound(repo: HostRepo, module: str) -> Iterator[str]:
+    """Names that a function reads which trains, and that neither it nor its script defines."""
+    tree, gone = repo.tree(module), _perhaps(repo, module)
+    functions = [nodes(each) for each in every(tree, ast.FunctionDef)]
+    inside = {node for each in functions for node in each[1:]}
+    outside = [each for each in nodes(tree) if each not in inside or isinstance(each, ast.Global)]
+    for part in learning(tree):
+        around = (node for each in functions if part in each for node in each)
+        bound = {*_named([*outside, *around]), *dir(builtins), "__file__"}
+        for name in (each for each in every(part, ast.Name) if each not in gone):
+            if name.id not in bound and "*" not in bound:
+                yield f"reads {name.id}, which nothing defines ({repo.at(module, name.lineno)})"
 
 
 _OURS = ("source_path", "model_path", "iterations", "checkpoint_iterations", "start_checkpoint")
@@ -288,14 +341,16 @@ def _key(node: ast.AST) -> str:
 @lru_cache(maxsize=64)
 def _bindings(tree: ast.AST | None) -> Counter[str]:
     """How often a module gives something a name."""
-    kinds = ("name", "asname", "arg", "id")
-    return Counter(
-        name
-        for node in nodes(tree)
-        if not isinstance(node, ast.keyword)
-        and isinstance(getattr(node, "ctx", ast.Store()), ast.Store)
-        for name in {str(getattr(node, kind, None)) for kind in kinds}
-    )
+    return Counter(_named(nodes(tree)))
+
+
+def _named(parts: Iterable[ast.AST]) -> Iterator[str]:
+    """The names that code gives, of each part."""
+    for node in parts:
+        if isinstance(getattr(node, "ctx", ast.Store()), ast.Store):
+            kinds = () if isinstance(node, ast.keyword) else ("name", "asname", "arg", "id")
+            names = {str(getattr(node, kind, "")) for kind in kinds} | {*getattr(node, "names", ())}
+            yield from {each.split(".")[0] for each in names if isinstance(each, str)}
 
 
 def _misfit(called: ast.AST | None, call: ast.Call, of_model: bool) -> str:

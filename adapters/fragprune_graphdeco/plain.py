@@ -249,8 +249,8 @@ def _of_drawing(repo: HostRepo, modules: Iterable[str]) -> Iterator[tuple[str, b
 
 
 def _moved(repo: HostRepo, callers: HostRepo) -> Iterator[tuple[str, bool]]:
-    """Shapes that ``render`` makes of arguments which are off, but which files of a folder give,
-    and whether its rows are drawn all the same.
+    """What ``render`` makes of arguments which are off, but which files of a folder give, and
+    whether its rows are drawn all the same.
     """
     texts = reading.texts_of(callers).items()
     for module, function in ((m, f) for m in _renderers(repo)[:1] for f in drawing_in(repo, m)[:1]):
@@ -260,6 +260,6 @@ def _moved(repo: HostRepo, callers: HostRepo) -> Iterator[tuple[str, bool]]:
         takes = [each.arg for each in function.args.args]
         words = [pair for call in calls for pair in passed(call, takes).items()]
         given = {name for name, value in words if not is_off(value)} & off_by_default(function)
-        for why, kept in Drawing(repo, module, function, on=given).shapes() if given else ():
-            if re.search(rf"from ([\w.]+, )*({'|'.join(sorted(given))}),", why):
+        for why, kept in Drawing(repo, module, function, on=given).inputs() if given else ():
+            if re.search(rf"from ([\w.]+, )*({'|'.join(sorted(given))})(,| \()", why):
                 yield why, kept

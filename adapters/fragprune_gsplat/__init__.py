@@ -14,8 +14,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fragprune_graphdeco import reading
 from fragprune_plugins.adapting import (
     GROUPS,
+    Finding,
     HostAdapter,
     HostInfo,
     HostRepo,
@@ -42,6 +44,8 @@ BASE = f"{PACKAGE}.strategy.base"
 RELOCATED = ("opacities", "scales", "ratios", "binoms")
 SHAPED = ("quats", "scales", "compute_covar", "compute_preci", "triu")
 DEFAULT, MCMC = f"{PACKAGE}.strategy.default", f"{PACKAGE}.strategy.mcmc"
+STRATEGIES = ("Strategy", "DefaultStrategy", "MCMCStrategy", "check_sanity")
+"""What the loop of whoever uses it names, one of them, where a model is attached."""
 DRAWN = ("means", "opacities", "viewmats", "Ks", "covars")  # arguments of ``rasterization``
 LPIPS = Seam(
     Role.METRIC, "torchmetrics.image.lpip", "LearnedPerceptualImagePatchSimilarity", external=True
@@ -177,6 +181,16 @@ class Gsplat(HostAdapter):
         Seam(Role.UNPACK, "torch", "load", ("f",), external=True, how=read_again),
         Seam(Role.SAVE, EXPORTER, "export_splats", ("save_to", "means", "format")),
     )
+
+    def fingerprint(self, repo: HostRepo) -> list[Finding]:
+        """Likewise; scripts that import it and no strategy are a host of its own, to which no model
+        is attached.
+        """
+        found, scripts = super().fingerprint(repo), (each.stem for each in repo.root.glob("*.py"))
+        if repo.package or reading.mentions(repo, reading.reached(repo, scripts), STRATEGIES):
+            return found
+        what, expected = f"draws by {PACKAGE} without its strategies", "a loop with a strategy"
+        return [Finding.error("own-host", repo.root, what, expected), *found]
 
     def seams_for(self, repo: HostRepo) -> tuple[Seam, ...]:
         """All; versions before 1.5.1 export nothing."""

@@ -42,13 +42,13 @@ def locate(
     try:
         return repo, choose(repo, adapters, name, select)
     except UnknownHostError:
-        named = name and name.replace("_", "-")
+        taken = [each for each in repo.imported if not (name or (repo.root / each).is_dir())]
         used = [
             package
             for adapter in adapters
             for package in adapter.installed[:1]
-            if named == adapter.name
-            or (not name and package in repo.imported and not (repo.root / package).is_dir())
+            if (name or "").replace("_", "-") == adapter.name
+            or (package in taken and "own-host" not in {e.code for e in adapter.match(repo).errors})
         ]
         if used and not name and any(each.held for each in attempt(repo, adapters).values()):
             raise  # a host of its own, that draws by that package

@@ -13,6 +13,7 @@ from fragprune_2dgs import SurfelSplatting
 from fragprune_plugins import Portable, Settings
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import InputError, UsageError
+from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import process
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.testing.invariants.case import FixedThresholds
@@ -47,6 +48,14 @@ def test_the_hosts_maps_are_those_of_the_oracle_in_its_order(mini):
         torch.testing.assert_close(drawn[name], tensor, rtol=1e-4, atol=1e-5)
     assert (drawn["rend_normal"].norm(dim=0) > 0.1).any()
     assert drawn["rend_dist"].max() > 0
+
+
+@pytest.mark.parametrize("maps", ["6:7", "7:10"])
+def test_a_drawing_that_reads_maps_beyond_these_is_refused(tmp_path, maps):
+    drawing = f"def render(pc):\n    image, radii, allmap = rasterizer()\n    f(allmap[{maps}])\n"
+    (tmp_path / "gaussian_renderer.py").write_text(drawing)
+    found = str(SurfelSplatting().fingerprint(HostRepo(tmp_path)))
+    assert ("reads allmap[7:10]" in found) == (maps == "7:10")
 
 
 def test_matrices_in_place_of_scales_are_refused(mini):

@@ -3,6 +3,7 @@
 import pytest
 from miniatures.skeletons import FLAGS, GROUPS, SETTINGS, STATES, skeleton
 
+from fragprune_gsplat import Gsplat
 from fragprune_plugins.adapting import HostRepo, Role, Seam, revised
 from fragprune_plugins.errors import UnknownHostError
 from fragprune_plugins.hosts.choosing import choose, locate
@@ -263,3 +264,17 @@ def test_the_folder_above_is_read_if_a_script_uses_it(tmp_path, line, found):
         return
     with pytest.raises(UnknownHostError):
         locate(inner, adapters)
+
+
+@pytest.mark.parametrize("more", ["", "from gsplat.strategy import MCMCStrategy\n"])
+def test_scripts_that_draw_by_gsplat_and_attach_no_model_are_a_host_of_their_own(
+    tmp_path, monkeypatch, more
+):
+    (tmp_path / "mine.py").write_text("from gsplat import rasterization\nimport loop\n")
+    (tmp_path / "loop").mkdir()
+    (tmp_path / "loop/__init__.py").write_text(more)
+    looked_at = []
+    monkeypatch.setattr(HostRepo, "installed", looked_at.append)
+    with pytest.raises(UnknownHostError):
+        locate(HostRepo(tmp_path), [Gsplat()])
+    assert looked_at == ["gsplat"] * bool(more)

@@ -782,7 +782,29 @@ REFUSED = [
     ("image, radii = rasterizer(", "return rasterizer(", "not unpacked"),
     ("return self._xyz\n", "return self.net()\n", "computed"),
 ]
+GIVES = "    def posed(self):\n        return self.x, self.y\n\n    def capture"
+NET = "class Net(torch.nn.Module):\n    def forward(self):\n        return x, y, z\n\n\nclass Gauss"
+TURNED = "        self.net = Net().cuda()\n\n    def posed(self):\n        return self.net()\n"
 REFUSED_TOGETHER = [
+    (
+        {},
+        [("    def capture", GIVES), (STATEMENT, "a, b, c = gaussians.posed()")],
+        "takes 3 values of posed, which gives 2 (train.py:",
+    ),
+    (
+        {},
+        [
+            ("class Gauss", NET),
+            ("sh_degree): ...\n", f"sh_degree):\n{TURNED}"),
+            (STATEMENT, "a, b = gaussians.posed()"),
+        ],
+        "takes 2 values of posed, which gives 3 (train.py:",
+    ),
+    (
+        {},
+        [("import *", "import view, opt"), (PARSES, f"\ndef f(pipe, loss): ...\n{PARSES}")],
+        "reads pipe, which nothing defines (train.py:",
+    ),
     ({"settings": ", mult=0.5"}, [], "mult, unknown"),
     ({"arguments": ", turned=pose"}, [], "turned, unknown"),
     ({"values": "image, radii, radii"}, [], "the radii once"),

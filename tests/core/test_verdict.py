@@ -106,6 +106,10 @@ JOINED = """    colours = torch.clamp_min(eval_sh(pc.get_features) + 0.5, 0)
     return {"render": image}
 """
 
+COLOURS = """        shs = pc.get_features
+        if dx is not None:
+            shs = shs + dx
+"""
 MOVES = """    means3D = pc.get_xyz
     if dx is not None:
         means3D = pc.get_xyz + dx
@@ -352,6 +356,7 @@ def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):
         ("opacity = pc.get_opacity\n", "opacity = pc.opacity_activation(pc._opacity)\n"),
         ("activation(self._scaling)", "activation(self._scaling.repeat(1, 3))"),
         ("shs = pc.get_features", "shs = pc.get_features(training)"),
+        ("shs = pc.get_features", "shs = getattr(pc, 'get_features', None)"),
         ("    means3D = pc.get_xyz\n", "    means3D = pc.net(t)\n    means3D = pc.get_xyz\n"),
         (CALLED, f"{CALLED}    opacity = pc.net(image)\n"),
         (CALLED, f"{CALLED}    image = image[:3]\n"),
@@ -585,9 +590,13 @@ def test_run_is_named_where_it_would_train(fork, tmp_path, inner):
     ("given", "kind"), [("dx=None", "finetune"), ("dx=dx", "never"), ("False, None, dx", "never")]
 )
 @pytest.mark.parametrize("inner", ["", "inner"])
-def test_an_argument_that_moves_them_is_off_if_no_file_gives_it(fork, tmp_path, inner, given, kind):
-    moved = "    means3D = pc.get_xyz\n", MOVES
-    fork(("override_color=None):", "override_color=None, dx=None):"), moved, root=tmp_path / inner)
+@pytest.mark.parametrize(
+    "change", [("    means3D = pc.get_xyz\n", MOVES), ("        shs = pc.get_features\n", COLOURS)]
+)
+def test_an_argument_that_moves_or_colours_them_is_off_if_no_file_gives_it(
+    fork, tmp_path, change, inner, given, kind
+):
+    fork(("override_color=None):", "override_color=None, dx=None):"), change, root=tmp_path / inner)
     (tmp_path / "slam.py").write_text(f"package = render(camera, model, pipe, bg, {given})\n")
     assert judged(HostRepo(tmp_path)).kind == kind
 
@@ -704,7 +713,7 @@ def test_another_kernel_makes_another_picture_of_the_same_ply(fork, tmp_path):
 def test_a_script_that_compiles_its_training_fits_nothing(tmp_path):
     skeleton(tmp_path)
     script = tmp_path / "train.py"
-    step = "\n\n%sdef step(loss):\n    loss.backward()\n"
+    step = "\n\nimport torch\n%sdef step(loss):\n    loss.backward()\n"
     text = script.read_text()
     script.write_text(text + step % "")
     assert judged(HostRepo(tmp_path)).kind == "fits"

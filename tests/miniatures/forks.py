@@ -92,6 +92,7 @@ def render(viewpoint_camera, pc, pipe, bg_color, override_color=None, chosen=Non
 TRAIN = (
     """
 from gaussian_renderer import render
+from given import *
 from scene import GaussianModel, Scene
 
 
