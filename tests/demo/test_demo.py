@@ -1,0 +1,243 @@
+"""The demo: its scene, its folder, and the whole, very small, as a user starts it."""
+
+import contextlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from cli.commands import run, run_json
+from PIL import Image
+
+from fragprune_plugins.errors import OutputError
+from fragprune_plugins.workbench.demo import folder, scene, work
+from fragprune_plugins.workbench.demo.work import BANNER, DemoSettings, host_command
+from fragprune_plugins.workbench.figures.wording import headlines, outcome
+from fragprune_plugins.workbench.scenes.dataset import load_dataset
+
+
+def seen(folder, name):
+    """Mean difference of the points' colours to a photograph, 8-bit levels, where they are seen."""
+    dataset = load_dataset(folder)
+    (shot,) = (each for each in [*dataset.train, *dataset.test] if each.name == name)
+    rows = [line.split() for line in (folder / "sparse/0/points3D.txt").read_text().splitlines()]
+    table = torch.tensor([[float(each) for each in row[1:7]] for row in rows])
+    local = torch.cat([table[:, :3], torch.ones(len(table), 1)], 1) @ shot.view.viewmatrix
+    width, height = shot.view.width, shot.view.height
+    reach = local[:, 2:3] * torch.tensor([shot.view.tan_fov_x, shot.view.tan_fov_y])
+    at = (local[:, :2] / reach + 1) / 2 * torch.tensor([width, height])
+    inside = ((at >= 0) & (at < torch.tensor([width, height]))).all(1) & (local[:, 2] > 0)
+    column, row = at[inside].long().T
+    colours = 255 * shot.image[:, row, column].T
+    return float((colours - table[inside, 3:]).abs().mean(1).median())
+
+
+@pytest.mark.parametrize(("views", "width", "points"), [(48, 320, 4000), (9, 80, 1000)])
+def test_points_have_the_photographs_colours_where_cameras_see(tmp_path, views, width, points):
+    scene.make_scene(tmp_path, views=views, width=width, points=points)
+    dataset = load_dataset(tmp_path)
+    assert len(dataset.train) + len(dataset.test) == views
+    assert len((tmp_path / "sparse/0/points3D.txt").read_text().splitlines()) == points
+    with Image.open(tmp_path / "images" / "view_003.webp") as picture:
+        assert picture.size == (width, width * 3 // 4)
+    for name in ("view_000.webp", "view_005.webp"):
+        right = seen(tmp_path, name)
+        assert right < 15
+        lines = (tmp_path / "sparse/0/images.txt").read_text().splitlines()
+        assert name in lines[2 * int(name[5:8])]
+
+
+def test_the_package_carries_less_than_a_megabyte():
+    files = [path for path in scene.ROOM.rglob("*") if path.is_file()]
+    assert sum(path.stat().st_size for path in files) < 900_000
+    assert len(files) == scene.VIEWS + 3
+
+
+def test_held_out_views_are_spread(tmp_path):
+    """Every eighth camera: both halves of the arc, high and low."""
+    scene.make_scene(tmp_path, width=40, points=10)
+    places = np.array([shot.view.campos.numpy() for shot in load_dataset(tmp_path).test])
+    azimuth = np.degrees(np.arctan2(places[:, 1], places[:, 0]))
+    assert azimuth.min() < 35
+    assert azimuth.max() > 55
+    assert np.ptp(places[:, 2]) > 0.8
+
+
+def contents(path):
+    return {str(p.relative_to(path)): p.read_bytes() for p in path.rglob("*") if p.is_file()}
+
+
+def write(path, text="x"):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+
+
+@pytest.fixture
+def made(tmp_path):
+    """A folder as a demo leaves it."""
+    out = tmp_path / "out"
+    folder.clear(out)
+    with folder.claiming(out, "model", "report.json"):
+        write(out / "model" / "point_cloud" / "point_cloud.ply")
+        write(out / "report.json")
+    return out
+
+
+def test_a_folder_with_our_names_is_not_ours(tmp_path, monkeypatch):
+    monkeypatch.setattr(work, "make_scene", None)  # never called
+    keep = tmp_path / "keep"
+    (keep / "scene").mkdir(parents=True)
+    write(keep / "model" / "precious.txt")
+    before = contents(keep)
+    result = run("demo", "--out", keep)
+    assert result.exit_code == 1
+    assert result.stderr.startswith("[output] ")
+    assert "model/precious.txt" in result.stderr
+    assert contents(keep) == before
+
+
+def test_an_earlier_demo_is_emptied_though_it_failed(made):
+    with contextlib.suppress(KeyboardInterrupt), folder.claiming(made, "pictures"):
+        write(made / "pictures" / "half.png")
+        raise KeyboardInterrupt
+    folder.clear(made)
+    assert [p.name for p in made.iterdir()] == [folder.MARKER]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "says"),
+    [
+        *((name, "x", name) for name in ("thesis.tex", "model/notes.txt", "model/point_cloud/a")),
+        ("model/point_cloud/point_cloud.ply", "trained on", r"point_cloud\.ply', changed since"),
+        *(
+            (folder.MARKER, text, "no demo wrote")
+            for text in ("", "[]", '{"files": 3}', '{"files": {"../a.txt": "x"}}')
+        ),
+    ],
+)
+def test_what_is_not_as_the_demo_left_it_keeps_all(made, name, text, says):
+    write(made.parent / "a.txt")
+    write(made / name, text)
+    before = contents(made.parent)
+    with pytest.raises(OutputError, match=says):
+        folder.clear(made)
+    assert contents(made.parent) == before
+
+
+def test_what_is_written_outside_the_claim_is_not_ours(made):
+    with folder.claiming(made, "pictures"):
+        write(made / "model" / "mine.txt")
+        write(made / "pictures" / "a.png")
+    with pytest.raises(OutputError, match=r"model/mine\.txt"):
+        folder.clear(made)
+
+
+def test_hidden_files_neither_count_nor_go(made):
+    write(made / "model" / ".DS_Store")
+    folder.clear(made)
+    assert sorted(contents(made)) == [folder.MARKER, "model/.DS_Store"]
+
+
+def test_a_link_is_not_followed(made, tmp_path):
+    write(tmp_path / "elsewhere" / "a.txt")
+    (made / "scene").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(OutputError, match="scene"):
+        folder.clear(made)
+    assert (tmp_path / "elsewhere" / "a.txt").exists()
+
+
+TINY = """
+import json, sys
+from pathlib import Path
+from fragprune_plugins.workbench.demo import folder
+from fragprune_plugins.workbench.demo.work import DemoSettings, run_demo
+settings = DemoSettings(iterations=30, finetune=12, views=12, width=48, points=400)
+print(json.dumps(run_demo(Path(sys.argv[1]), settings)))
+"""
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    out = tmp_path_factory.mktemp("demo") / "out"
+    path = os.pathsep.join(filter(None, sys.path))
+    how = {"env": os.environ | {"PYTHONPATH": path, "OMP_WAIT_POLICY": "PASSIVE"}, "timeout": 240}
+    words = [sys.executable, "-c", TINY, str(out)]
+    result = subprocess.run(words, capture_output=True, text=True, **how)
+    assert result.returncode == 0, result.stderr
+    return out, json.loads(result.stdout), result.stderr
+
+
+def test_report_has_the_names_of_every_report(demo):
+    out, report, stderr = demo
+    assert stderr.count("Training") >= 2  # progress, throughout
+    names = {"psnr", "ssim", "lpips", "fragments_per_pixel", "evaluated_per_pixel", "gaussians"}
+    for side in ("before", "after", "control"):
+        assert names | {"frame_ms", "frame_ms_se"} <= report[side].keys()
+    assert report["after"]["fragments_per_pixel"] < report["before"]["fragments_per_pixel"]
+    assert report["iterations"] == 12
+    assert report["keep"] is not None
+    assert report["after"]["gaussians"] < report["before"]["gaussians"]
+    assert report["adapter"] == "vanilla-3dgs"
+    assert report["device"] == "cpu"
+    saved = json.loads((out / "report.json").read_text())
+    assert saved == report
+
+
+def test_control_shows_what_as_many_iterations_give_without_pruning(demo):
+    _, report, _ = demo
+    gain = report["control"]["psnr"] - report["before"]["psnr"]
+    assert gain != 0
+    assert report["control"]["gaussians"] == report["before"]["gaussians"]
+    assert f"{gain:+.2f} dB: pruning itself makes" in outcome("run", report, report["control"])
+
+
+def test_the_control_is_the_hosts_own_training_resumed_from_the_same_checkpoint(demo):
+    out, report, _ = demo
+    (control,) = (out / "model" / "control").rglob("point_cloud.ply")
+    measured = run_json("compare", report["model_before"], control, "--data", out / "scene")
+    assert measured["b"]["psnr"] == pytest.approx(report["control"]["psnr"], abs=1e-4)
+
+
+def test_pictures_and_page_are_there(demo):
+    out, report, _ = demo
+    for file in report["files"]:
+        assert (out / file).stat().st_size > 0
+    page = (out / "index.html").read_text()
+    for file in report["files"]:
+        assert file in page or file in ("index.html", f"pictures/{BANNER}")
+    (_, (_, said), _) = headlines(report, report["control"])  # the frame times of its sentence
+    assert said in page
+    assert Path(report["model_after"]).exists()
+
+
+def test_report_shows_the_demos_folder(demo, tmp_path):
+    out, demos, _ = demo
+    report = run_json("report", out, "--out", tmp_path / "page.html")
+    assert (report["command"], report["adapter"]) == ("run", "vanilla-3dgs")
+    assert report["after"] == demos["after"]
+    assert report["result"].endswith(outcome("run", demos, demos["control"]))
+    (note,) = report["notes"]
+    assert note in (out / "index.html").read_text()
+    assert "Gaussians before learning" in note
+    assert len(report["views"]) > 0
+    text = (tmp_path / "page.html").read_text()
+    assert text.count('src="data:image/png;base64,') == report["pictures"] > 7
+
+
+def test_all_of_it_is_the_next_demos_to_delete(demo, tmp_path):
+    out = shutil.copytree(demo[0], tmp_path / "out")
+    folder.clear(out)
+    assert [path.name for path in out.iterdir()] == [folder.MARKER]
+
+
+def test_command_is_one_a_user_could_type():
+    command = host_command(Path("scene"), Path("model"), DemoSettings(iterations=500, seed=4))
+    assert Path(command[0]).name == "train.py"
+    for flag, value in (("iterations", "500"), ("densify_until_iter", "325"), ("seed", "4")):
+        assert command[command.index(f"--{flag}") + 1] == value
+    assert command[-1] == "--eval"
