@@ -6,6 +6,7 @@ import cutoff_files
 import numpy as np
 import pytest
 import torch
+from cutoff_files import FRAGMENTS, PSNR_MIN
 from PIL import Image
 
 from fragprune_plugins import RasterInputs, load, load_cameras
@@ -46,11 +47,8 @@ def test_our_engine_draws_every_carrier_as_expected(folder, said, scene):
     for name in said["scenes"][scene]["files"]:
         for view, of in said["scenes"][scene]["views"].items():
             image, fragments = drawn(folder / name, said["views"][view])
-            assert psnr(image, expected(folder / of["picture"])) > cutoff_files.PSNR_MIN, (
-                name,
-                view,
-            )
-            assert fragments == pytest.approx(of["fragments_per_pixel"], rel=cutoff_files.FRAGMENTS)
+            assert psnr(image, expected(folder / of["picture"])) > PSNR_MIN, (name, view)
+            assert fragments == pytest.approx(of["fragments_per_pixel"], rel=FRAGMENTS)
 
 
 @pytest.mark.parametrize("scene", cutoff_files.SCENES)
@@ -58,13 +56,11 @@ def test_a_renderer_that_ignores_cutoffs_fails(folder, said, scene):
     for view, of in said["scenes"][scene]["views"].items():
         plain = folder / said["scenes"][scene]["file_without_cutoffs"]
         image, fragments = drawn(plain, said["views"][view])
-        assert psnr(image, expected(folder / of["picture"])) < cutoff_files.PSNR_MIN - 10
-        assert fragments > (1 + 5 * cutoff_files.FRAGMENTS) * of["fragments_per_pixel"]
+        assert psnr(image, expected(folder / of["picture"])) < PSNR_MIN - 10
+        assert fragments > (1 + 5 * FRAGMENTS) * of["fragments_per_pixel"]
         ignored = of["without_cutoffs"]
-        assert psnr(image, expected(folder / ignored["picture"])) > cutoff_files.PSNR_MIN
-        assert fragments == pytest.approx(
-            ignored["fragments_per_pixel"], rel=cutoff_files.FRAGMENTS
-        )
+        assert psnr(image, expected(folder / ignored["picture"])) > PSNR_MIN
+        assert fragments == pytest.approx(ignored["fragments_per_pixel"], rel=FRAGMENTS)
 
 
 @pytest.mark.parametrize("scene", cutoff_files.SCENES)

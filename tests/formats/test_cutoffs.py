@@ -18,8 +18,9 @@ def test_codes_are_the_powers_that_the_specification_names():
     assert decode(ALL).dtype == np.float32
 
 
-def test_decoding_and_encoding_gives_each_code_back():
-    assert np.array_equal(encode(decode(ALL)), ALL)
+def test_decoding_and_encoding_gives_each_code_back_in_its_place():
+    square = torch.from_numpy(decode(ALL)).reshape(16, 16)
+    assert np.array_equal(encode(square), ALL.reshape(16, 16))
     assert (np.diff(decode(ALL)) > 0).all()
 
 
@@ -41,10 +42,6 @@ def test_error_is_at_most_half_a_step_of_q(tau):
 def test_codes_keep_the_order(one, other):
     low, high = encode(sorted([one, other]))
     assert low <= high
-
-
-def test_tensors_and_shapes_are_kept():
-    assert encode(torch.full((2, 3), 0.5)).shape == (2, 3)
 
 
 @pytest.mark.parametrize("wrong", [math.nan, -0.1, 1.1, math.inf])

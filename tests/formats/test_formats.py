@@ -16,8 +16,8 @@ from finetune import tiny
 from formats.scenes import apart, random_splat, splats
 from hypothesis import given, settings
 
-from fragprune_plugins import ThresholdStore, load, load_dataset, measure, save
-from fragprune_plugins.errors import FragpruneError, ModelFileError, OutputError, PluginError
+from fragprune_plugins import ThresholdStore, load, load_dataset, measure, rasterize, save
+from fragprune_plugins.errors import ModelFileError, OutputError, PluginError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.workbench.models import cutoffs, formats
@@ -26,40 +26,22 @@ from fragprune_plugins.workbench.models.formats.ply import write_ply
 
 # Half a step of each format's own quantisation, with the values that ``random_splat`` has.
 # xyz lie within 8 (16 across), colours within 0.5 +- 0.43, log scales within -7 to 1.
+# SPZ rounds rest to one of 256 levels, then to every 16th; its scales differ by 3 % each, so
+# variances by 6 %. SOG: d x / d log(1 + x) is at most 9; so few values have codebooks of their own.
+KINDS = ("xyz", "colour", "rest", "opacity", "scaling", "shape")
 BOUNDS = {
-    ".spz": {
-        "xyz": 0.5 / 4096,
-        "colour": 0.28209479 * 0.5 / 255 / 0.15,
-        "rest": 8.5 / 128,  # rounded to one of 256 levels, then to every 16th
-        "opacity": 0.5 / 255,
-        "scaling": 1 / 32,
-        "shape": 0.13,  # scales differ by 3 % each, so variances by 6 %
-    },
-    ".glb": {"xyz": 0, "colour": 0, "rest": 0, "opacity": 1e-6, "scaling": 1e-5, "shape": 1e-4},
-    ".sog": {
-        "xyz": 9 * 2 * math.log(9) / 65535 / 2 * 1.01,  # d x / d log(1 + x) is at most 9
-        "colour": 1e-6,  # so few values have a codebook of their own, but for the rest
-        "rest": 0.02,
-        "opacity": 0.5 / 255,
-        "scaling": 1e-6,
-        "shape": 0.02,
-    },
-    ".compressed.ply": {
-        "xyz": 16 / 1023 / 2,
-        "colour": 0.86 / 255 / 2,
-        "rest": 8 / 256 * 1.01,
-        "opacity": 0.5 / 255,
-        "scaling": 8 / 1023 / 2,
-        "shape": 0.03,
-    },
-    ".splat": {
-        "xyz": 0,
-        "colour": 0.51 / 255,
-        "rest": 0,
-        "opacity": 0.51 / 255,
-        "scaling": 1e-5,
-        "shape": 0.03,
-    },
+    ".spz": (0.5 / 4096, 0.28209479 * 0.5 / 255 / 0.15, 8.5 / 128, 0.5 / 255, 1 / 32, 0.13),
+    ".glb": (0, 0, 0, 1e-6, 1e-5, 1e-4),
+    ".sog": (9 * 2 * math.log(9) / 65535 / 2 * 1.01, 1e-6, 0.02, 0.5 / 255, 1e-6, 0.02),
+    ".compressed.ply": (
+        16 / 1023 / 2,
+        0.86 / 255 / 2,
+        8 / 256 * 1.01,
+        0.5 / 255,
+        8 / 1023 / 2,
+        0.03,
+    ),
+    ".splat": (0, 0.51 / 255, 0, 0.51 / 255, 1e-5, 0.03),
 }
 SORTED = (".sog", ".compressed.ply")
 CARRIERS = (".spz", ".sog", ".glb")
@@ -82,7 +64,7 @@ def test_what_is_written_comes_back(suffix, splat):
         splat = ordered(splat, morton_order(splat))
     if suffix == ".splat":
         splat = replace(splat, f_rest=splat.f_rest[:, :0])
-    found, bounds = apart(splat, back), BOUNDS[suffix]
+    found, bounds = apart(splat, back), dict(zip(KINDS, BOUNDS[suffix], strict=True))
     assert all(found[name] <= bounds[name] + 2e-6 for name in found), (found, bounds)  # float32
     assert back.rotation.is_contiguous()  # else each frame copies it, and its time is no file's
 
@@ -129,9 +111,8 @@ def test_the_same_model_gives_the_same_bytes(suffix, tmp_path):
 @pytest.mark.parametrize("suffix", [".splat", ".compressed.ply"])
 def test_a_format_without_thresholds_refuses_them(suffix, tmp_path):
     path = tmp_path / f"a{suffix}"
-    with pytest.raises(
-        OutputError, match=rf"\[output\] {path}: a .*cannot hold cutoffs.*--no-truncation"
-    ):
+    said = rf"\[output\] {path}: a .*cannot hold cutoffs.*--no-truncation"
+    with pytest.raises(OutputError, match=said):
         save(path, tiny.cut(random_splat(5, 0, 0), 0.4))
     assert list(tmp_path.iterdir()) == []
 
@@ -162,21 +143,18 @@ def test_a_stop_and_a_soft_rim_come_back(suffix, rim, truncated, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("rule", "said"),
     [
-        ((b"rim soft", b"rim wet!"), r"rim: 'wet!'; expected hard or soft"),
-        *(
-            ((b"stop 0.25", f"stop {stop}".encode()), r"stop|float")
-            for stop in ("0", "2", "nan", "much")
-        ),
+        (b"rim wet!", r"rim: 'wet!'; expected hard or soft"),
+        *((rule, "stop|float") for rule in (b"stop 0", b"stop 2", b"stop nan", b"stop much")),
     ],
 )
-def test_rules_that_cannot_be_are_refused(change, said, tmp_path):
+def test_rules_that_cannot_be_are_refused(rule, said, tmp_path):
     splat = tiny.cut(random_splat(5, 1, 0), 0.3).with_rules(rim="soft", stop=0.25)
     write_ply(path := tmp_path / "model.ply", splat)
-    content = path.read_bytes()
-    assert content.count(b"comment fragprune " + change[0] + b"\n") == 1
-    path.write_bytes(content.replace(*change))
+    known = b"comment fragprune " + (b"rim soft" if b"rim" in rule else b"stop 0.25") + b"\n"
+    assert path.read_bytes().count(known) == 1
+    path.write_bytes(path.read_bytes().replace(known, b"comment fragprune " + rule + b"\n"))
     with pytest.raises(ModelFileError, match=said):
         load(path)
 
@@ -184,17 +162,12 @@ def test_rules_that_cannot_be_are_refused(change, said, tmp_path):
 @pytest.mark.parametrize("signs", [(-1, -1, 1), (1, -1, -1)])
 def test_a_turned_scene_looks_the_same_from_a_turned_camera(signs):
     """The SH signs, against an evaluation of the basis at turned directions."""
-    from fragprune_plugins import rasterize
-    from fragprune_plugins.types import RasterInputs
-    from fragprune_plugins.workbench.scenes.pinhole import Camera
-
     splat, camera = tiny.random_model(degree=3), tiny.cameras(9)[2]
     flip = torch.diag(torch.tensor(signs, dtype=torch.float64))
-    lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-    moved = Camera(camera.rotation @ flip, camera.translation, *lens)
+    moved = replace(camera, rotation=camera.rotation @ flip)
     with torch.no_grad():
-        one = rasterize(RasterInputs(camera.view(), splat.splats())).image
-        other = rasterize(RasterInputs(moved.view(), turned(splat, signs).splats())).image
+        one = rasterize(splat, camera.view()).image
+        other = rasterize(turned(splat, signs), moved.view()).image
     assert float((one - other).abs().max()) < 1e-4
 
 
@@ -211,40 +184,38 @@ def test_sog_beside_its_images(tmp_path):
         load(meta)
 
 
-def with_records(content: bytes, flags: int, records: bytes) -> bytes:
-    """An SPZ with records between its head and its table, and flags that say so."""
-    head = content[:14] + bytes([flags]) + content[15:16] + struct.pack("<I", 32 + len(records))
-    return head + content[20:32] + records + content[32:]
-
-
-def test_spz_names_its_axes(tmp_path):
-    """The record that says RUB turns y and z; one that exchanges axes is refused."""
+@pytest.fixture
+def spz(tmp_path):
+    """Reads an SPZ with a record between its head and its table, and flags that say so."""
     path = tmp_path / "a.spz"
-    splat = random_splat(5, 1, 0)
-    save(path, splat)
+    save(path, random_splat(5, 1, 0))
     content = path.read_bytes()
 
-    def axes(system):
-        record = struct.pack("<III", 0xADBE0003, 4, system)
-        path.write_bytes(with_records(content, 2, record))
+    def reread(flags, record):
+        start = struct.pack("<I", 32 + len(record)) + content[20:32] + record + content[32:]
+        path.write_bytes(content[:14] + bytes([flags]) + content[15:16] + start)
         return load(path)
 
-    plain = load(path)
+    return reread
+
+
+def test_spz_names_its_axes(spz, tmp_path):
+    """The record that says RUB turns y and z; one that exchanges axes is refused."""
+    plain = load(tmp_path / "a.spz")
+
+    def axes(system):
+        return spz(2, struct.pack("<III", 0xADBE0003, 4, system))
+
     assert torch.equal(axes(6).xyz, plain.xyz)
     assert torch.equal(axes(4).xyz, plain.xyz * torch.tensor([1.0, -1.0, -1.0]))
     with pytest.raises(ModelFileError, match="coordinate system 12"):
         axes(12)
 
 
-def test_what_is_not_followed_is_named(tmp_path, caplog):
-    path = tmp_path / "a.spz"
-    save(path, random_splat(5, 1, 0))
-    content = path.read_bytes()
-    assert load(path)
+def test_what_is_not_followed_is_named(spz, tmp_path, caplog):
+    load(tmp_path / "a.spz")
     assert not caplog.messages
-    record = struct.pack("<II", 0xADBE0002, 12) + bytes(12)
-    path.write_bytes(with_records(content, 3, record))
-    assert load(path)
+    spz(3, struct.pack("<II", 0xADBE0002, 12) + bytes(12))
     assert "antialiasing" in caplog.messages[0]
     assert "0xadbe0002" in caplog.messages[1]
 
@@ -274,7 +245,9 @@ def test_spz_of_a_scene_wider_than_its_usual_bits(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".spz", ".sog", ".glb", ".splat"])
-@pytest.mark.parametrize("content", [b"", b"\0" * 7, b"NGSP", b"PK\x03\x04", b"glTF\x02", b"ply\n"])
+@pytest.mark.parametrize(
+    "content", [b"", bytes(7), bytes(40), b"NGSP", b"PK\x03\x04", b"glTF\x02", b"ply\n"]
+)
 def test_what_is_no_such_file_is_one_error(suffix, content, tmp_path):
     path = tmp_path / f"a{suffix}"
     path.write_bytes(content)
@@ -333,6 +306,7 @@ def test_commands_convert(suffix, tmp_path):
     report = run_json("export", path, "--out", out, *flag)
     assert (report["format"], report["thresholds"]) == (form.name, bool(form.thresholds))
     assert report["keeps"] == (form.keeps or None)
+    assert report["column"] == ("trunc_threshold" if suffix == ".ply" else None)
     text = run("export", path, "--out", out, *flag).stdout
     assert form.keeps in text
     run_json("export", out, "--out", back, *flag)
@@ -358,27 +332,13 @@ def test_finetune_reads_and_writes_spz(tmp_path):
     assert "cannot hold cutoffs" in refused.stderr
 
 
-@pytest.mark.parametrize("wrong", ["positions", "no file"])
-def test_values_that_cannot_be_drawn_are_refused(wrong, tmp_path):
-    path = tmp_path / "a.splat"
-    save(path, random_splat(3, 0, 0))
-    content = bytearray(path.read_bytes())
-    content[0:4] = b"\xff\xff\xff\x7f"  # NaN
-    path.write_bytes(content if wrong == "positions" else content[:40])
-    with pytest.raises(FragpruneError, match="NaN" if wrong == "positions" else "multiple"):
-        load(path)
-
-
-def sog_with(path: Path, name: str, content: bytes, how: int) -> Path:
-    """A SOG with one image replaced, compressed in another way."""
-    save(path.with_name("good.sog"), tiny.random_model(40))
-    with (
-        zipfile.ZipFile(path.with_name("good.sog")) as good,
-        zipfile.ZipFile(path, "w", how) as bomb,
-    ):
-        for each in good.namelist():
-            bomb.writestr(each, content if each == name else good.read(each))
-    return path
+def test_values_that_cannot_be_drawn_are_refused(tmp_path):
+    save(tmp_path / "a.splat", random_splat(3, 0, 0))
+    content = (tmp_path / "a.splat").read_bytes()
+    (tmp_path / "a.splat").write_bytes(b"\xff\xff\xff\x7f" + content[4:])  # NaN
+    with pytest.raises(ModelFileError, match="NaN") as stated:
+        load(tmp_path / "a.splat")
+    assert stated.value.where == str(tmp_path / "a.splat")
 
 
 @pytest.mark.parametrize(
@@ -387,10 +347,14 @@ def sog_with(path: Path, name: str, content: bytes, how: int) -> Path:
 )
 def test_a_sog_that_unpacks_into_much_more_is_refused(tmp_path, how, words):
     """Python's zipfile unpacks bzip2 at once, whatever size is asked for."""
-    bomb = sog_with(tmp_path / "bomb.sog", "means_l.webp", bytes(64_000_000), how)
-    assert bomb.stat().st_size < 100_000
+    save(tmp_path / "good.sog", tiny.random_model(40))
+    path = tmp_path / "bomb.sog"
+    with zipfile.ZipFile(tmp_path / "good.sog") as good, zipfile.ZipFile(path, "w", how) as bomb:
+        for name in good.namelist():
+            bomb.writestr(name, bytes(64_000_000) if name == "means_l.webp" else good.read(name))
+    assert path.stat().st_size < 100_000
     with pytest.raises(ModelFileError, match=words):
-        load(bomb)
+        load(path)
 
 
 def test_an_spz_that_unpacks_into_much_more_is_refused(tmp_path):
