@@ -6,6 +6,9 @@ import pytest
 import torch
 from cli.commands import DRAWING, drawing, run, run_json
 from finetune import tiny
+from finetune.conftest import dataset as dataset  # a fixture, as the others are
+from finetune.conftest import model as model
+from finetune.conftest import truth as truth
 
 import fragprune_plugins
 from fragprune_plugins import RasterInputs, Schedule, Settings, ThresholdStore, finetune
@@ -111,16 +114,6 @@ def test_an_unknown_engine_is_refused_with_those_that_are_known(command, scene, 
     assert "plugins asked: my_plugin" in result.stderr
     assert not (tmp_path / "m").exists()
     assert not (tmp_path / "demo").exists()
-
-
-@pytest.fixture(scope="module")
-def model():
-    return tiny.perturbed(tiny.random_model())
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    return tiny.dataset_in_memory(tmp_path_factory.mktemp("images"), tiny.random_model())
 
 
 def test_finetune_learns_by_a_plugins_schedule(model, dataset, plug):

@@ -1,6 +1,7 @@
 """Plugins are found, blocked, loaded one by one and checked; none stops another."""
 
 import logging
+from types import SimpleNamespace
 
 import pytest
 
@@ -42,16 +43,8 @@ def names(plugins):
     return [adapter.name for adapter in plugins.adapters]
 
 
-class Misspelt:
-    @hookimpl
-    def fragprune_trunkate(self, inputs, store):
-        """No such hook."""
-
-
-class WrongArgument:
-    @hookimpl
-    def fragprune_truncate(self, inputs, tau):
-        """The hook has no such argument."""
+MISSPELT = SimpleNamespace(fragprune_trunkate=hookimpl(lambda inputs, store: None))
+"""There is no such hook."""
 
 
 class Broken(Vanilla3DGS):
@@ -59,27 +52,25 @@ class Broken(Vanilla3DGS):
         raise RuntimeError("my table is missing")
 
 
-class Wrapper:
-    @hookimpl(wrapper=True)
-    def fragprune_truncate(self, inputs, store):
-        return (yield)
-
-
-class Nameless(Vanilla3DGS):
-    name = None
+@hookimpl(wrapper=True)
+def wrapper(inputs, store):
+    return (yield)
 
 
 FAULTS = {
     "import fails": (ImportError("libfancy.so is missing"), "ImportError: libfancy.so is missing"),
     "import raises": (ZeroDivisionError("at import"), "ZeroDivisionError"),
-    "misspelt hook": (Misspelt(), "fragprune_trunkate"),
+    "import exits": (SystemExit(7), "SystemExit: 7"),
+    "misspelt hook": (MISSPELT, "fragprune_trunkate"),
     "no hooks": (logging, "no hooks"),  # where an older installation names a module
-    "unknown argument": (WrongArgument(), "tau"),
+    "unknown argument": (
+        SimpleNamespace(fragprune_truncate=hookimpl(lambda inputs, tau: None)),
+        "tau",
+    ),
     "adapter raises": (Broken, "RuntimeError: my table is missing"),
     "adapter is abstract": (HostAdapter, "abstract class HostAdapter"),
-    "import exits": (SystemExit(7), "SystemExit: 7"),
-    "wrapper": (Wrapper(), "fragprune_truncate is a wrapper"),
-    "no name": (Nameless, "has no name (str)"),
+    "wrapper": (SimpleNamespace(fragprune_truncate=wrapper), "fragprune_truncate is a wrapper"),
+    "no name": (type("Nameless", (Vanilla3DGS,), {"name": None}), "has no name (str)"),
 }
 
 
@@ -122,10 +113,7 @@ def test_a_second_distribution_under_the_same_name_is_reported():
     assert codes(plugins) == [("warning", "plugin-shadowed")]
     assert "twin_module" in plugins.findings[0].where
     assert "good_module" in plugins.findings[0].found
-
-
-def test_the_same_entry_point_listed_twice_is_not_a_conflict():
-    assert codes(load_plugins([GOOD, GOOD])) == []
+    assert codes(load_plugins([GOOD, GOOD])) == []  # the same entry point listed twice
 
 
 def test_an_adapter_offered_twice_is_reported():
@@ -140,7 +128,7 @@ def test_an_adapter_offered_twice_is_reported():
 def test_a_plugin_that_is_refused_leaves_its_name_free():
     loaded = Plugins()
     with pytest.raises(PluginError, match="fragprune_trunkate"):
-        loaded.register(Misspelt(), "mine")
+        loaded.register(MISSPELT, "mine")
     first = adapter("a-host")
     loaded.register(first, "mine")
     assert names(loaded) == ["a-host"]
