@@ -4,7 +4,6 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from finetune import tiny
 
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.workbench.bench import timing
@@ -57,10 +56,9 @@ def test_the_clock_runs_from_idle_to_idle(events, monkeypatch):
     assert (made, spent) == ("made", 250.0)
 
 
-def test_every_timed_frame_of_a_measurement_waits(events, tmp_path):
-    model = tiny.random_model()
-    shots = tiny.dataset_in_memory(tmp_path, model).test
-    measure_all([Candidate(model)] * 2, shots, engine=Notes(events), repeats=3)
+def test_every_timed_frame_of_a_measurement_waits(events, truth, dataset):
+    shots = dataset.test
+    measure_all([Candidate(truth)] * 2, shots, engine=Notes(events), repeats=3)
     looked_at, frames = 2 * 2 * len(shots), 3 * 2 * len(shots)
     assert events[:looked_at] == ["draw"] * looked_at
     assert events[looked_at:] == ["idle cpu", "draw", "idle cpu"] * frames

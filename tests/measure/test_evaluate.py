@@ -24,13 +24,8 @@ NAMES = {
 
 
 @pytest.fixture(scope="module")
-def truth():
-    return tiny.random_model()
-
-
-@pytest.fixture(scope="module")
-def shots(truth, tmp_path_factory):
-    return tiny.dataset_in_memory(tmp_path_factory.mktemp("images"), truth).test
+def shots(dataset):
+    return dataset.test
 
 
 def test_report_of_the_truth(truth, shots):
@@ -82,36 +77,23 @@ def test_what_is_no_data_set_or_settings_is_named(truth, shots):
             use()
 
 
-class Smaller:
-    """An engine of a plugin that draws at another size than it was asked for."""
-
-    name = "smaller"
-
-    def rasterize(self, inputs, thresholds):
-        outputs = engine_for("reference").rasterize(inputs, thresholds)
-        return replace(outputs, image=outputs.image[:, ::2, ::2])
-
-
-class Nothing:
-    """Likewise, with pixels that are no numbers."""
-
-    name = "nothing"
-
-    def rasterize(self, inputs, thresholds):
-        outputs = engine_for("reference").rasterize(inputs, thresholds)
-        return replace(outputs, image=outputs.image.where(outputs.image > 0.2, torch.nan))
-
-
 @pytest.mark.parametrize(
-    ("engine", "said"),
+    ("change", "said"),
     [
-        (Smaller(), r"engine smaller.*\(3, 16, 16\).*\(3, 32, 32\)"),
-        (Nothing(), r"engine nothing: NaN in [1-9]\d* of 1024 pixels"),
+        (lambda image: image[:, ::2, ::2], r"\(3, 16, 16\).*\(3, 32, 32\)"),
+        (lambda image: image.where(image > 0.2, torch.nan), r": NaN in [1-9]\d* of 1024 pixels"),
     ],
 )
-def test_an_engine_that_draws_no_picture_of_the_view_is_named(truth, shots, engine, said):
-    with pytest.raises(EngineError, match=said):
-        measure(truth, shots, engine=engine)
+def test_an_engine_that_draws_no_picture_of_the_view_is_named(truth, shots, change, said):
+    class Otherwise:
+        name = "otherwise"
+
+        def rasterize(self, inputs, thresholds):
+            outputs = engine_for("reference").rasterize(inputs, thresholds)
+            return replace(outputs, image=change(outputs.image))
+
+    with pytest.raises(EngineError, match=f"engine otherwise.*{said}"):
+        measure(truth, shots, engine=Otherwise())
 
 
 def test_images_are_written_as_seen(tmp_path):

@@ -24,12 +24,10 @@ def one(opacity=0.5, size=0.2):
 @pytest.mark.parametrize(
     ("viewer", "opacity", "squared"),
     [
-        ("antimatter15/splat", 0.5, 8.0),
-        ("antimatter15/splat", 0.02, 8.0),  # however faint
+        *(("antimatter15/splat", opacity, 8.0) for opacity in (0.5, 0.02)),  # however faint
         ("three.js GaussianSplatMesh", 0.02, 4.0),
-        ("PlayCanvas", 0.5, 8.0),
+        *(("PlayCanvas", 0.5, 8.0), ("PlayCanvas", 0.002, 0.0)),
         ("PlayCanvas", 0.05, 2 * math.log(255 * 0.05)),
-        ("PlayCanvas", 0.002, 0.0),
     ],
 )
 def test_a_quad_around_one_gaussian(viewer, opacity, squared):

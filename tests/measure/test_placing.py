@@ -83,13 +83,10 @@ def test_nobody_looks_out_of_the_open_side():
 
 def test_thin_haze_all_around_is_no_air():
     """Large faint Gaussians before every wall: no place is open, so cameras stay outside."""
-    walls = room()
-    haze = tiny.round_ones(
-        0.2 * torch.randn(60, 3, generator=torch.Generator().manual_seed(1)), 1.0, 0.3
-    )
+    walls, stream = room(), torch.Generator().manual_seed(1)
+    haze = tiny.round_ones(0.2 * torch.randn(60, 3, generator=stream), 1.0, 0.3)
     both = {name: torch.cat([each, haze.tensors[name]]) for name, each in walls.tensors.items()}
-    model = Model(**both)
-    assert place(model, 4, ENGINE).enclosed < place(walls, 4, ENGINE).enclosed
+    assert place(Model(**both), 4, ENGINE).enclosed < place(walls, 4, ENGINE).enclosed
 
 
 @pytest.mark.parametrize(("model", "side"), [(room, "orbit"), (thing, "inside")])
@@ -102,7 +99,6 @@ def test_it_can_be_asked_for(model, side):
 
 
 def test_the_same_model_is_looked_at_from_the_same_places():
-    for (_, one), (_, other) in zip(
-        place(room(), 6, ENGINE).views, place(room(), 6, ENGINE).views, strict=True
-    ):
-        assert torch.equal(one.viewmatrix, other.viewmatrix)
+    one, other = (place(room(), 6, ENGINE).views for _ in range(2))
+    for (_, view), (_, again) in zip(one, other, strict=True):
+        assert torch.equal(view.viewmatrix, again.viewmatrix)

@@ -65,11 +65,11 @@ def test_the_removal_error_is_estimated_without_bias(truncated):
 
 
 def test_the_removal_error_is_the_same_every_time():
-    model = scene(False)
-    torch.manual_seed(1)
-    first = scores.removal_error(model, VIEWS, create_engine("auto"))
-    torch.manual_seed(2)
-    assert torch.equal(first, scores.removal_error(model, VIEWS, create_engine("auto")))
+    found = []
+    for seed in (1, 2):
+        torch.manual_seed(seed)
+        found.append(scores.removal_error(scene(False), VIEWS, create_engine("auto")))
+    assert torch.equal(*found)
 
 
 @pytest.mark.parametrize(("share", "count"), [(1.0, 5), (0.6, 3), (0.5, 2), (0.01, 1)])
@@ -100,12 +100,9 @@ def test_thresholds_and_moments_stay_with_their_rows():
     assert all(torch.equal(each, expected[k]) for k, each in tiny.state(smaller).items())
 
 
-def test_what_can_be_spared_costs_no_more_than_its_share_of_the_error(tmp_path):
-    truth = tiny.random_model()
-    model, shots = tiny.perturbed(truth), tiny.dataset_in_memory(tmp_path, truth).train
-    engine = create_engine("auto")
+def test_what_can_be_spared_costs_no_more_than_its_share_of_the_error(model, dataset):
+    shots, engine, splats = dataset.train, create_engine("auto"), model.splats()
     left = scores.keep_needed(model, shots, engine=engine)
-    splats = model.splats()
     with torch.no_grad():
         pictures = [(engine.rasterize(RasterInputs(s.view, splats), None).image, s) for s in shots]
     error = sum(float((p.clamp(0, 1) - s.image).square().sum()) for p, s in pictures)
@@ -117,19 +114,16 @@ def test_what_can_be_spared_costs_no_more_than_its_share_of_the_error(tmp_path):
     assert each[gone].max() <= each[~gone].min()
 
 
-def test_six_in_ten_stay_even_if_all_can_be_spared(tmp_path, monkeypatch):
-    truth = tiny.random_model()
+def test_six_in_ten_stay_even_if_all_can_be_spared(truth, dataset, monkeypatch):
     monkeypatch.setattr(scores, "SPARE", 1e9)
-    shots = tiny.dataset_in_memory(tmp_path, truth).train
-    worth = scores.removal_error(truth, [s.view for s in shots], create_engine("auto"))
-    left = scores.keep_needed(truth, shots)
+    views = [shot.view for shot in dataset.train]
+    worth = scores.removal_error(truth, views, create_engine("auto"))
+    left = scores.keep_needed(truth, dataset.train)
     assert torch.equal(left.xyz, truth.xyz[scores.best(worth, 0.6)])
 
 
-def test_the_budget_is_of_a_view_whichever_views_must_not_change(tmp_path):
-    truth = tiny.random_model()
-    model, shots = tiny.perturbed(truth), tiny.dataset_in_memory(tmp_path, truth).train
-    seen, views = shots[:1], [shot.view for shot in shots]
+def test_the_budget_is_of_a_view_whichever_views_must_not_change(model, dataset):
+    seen, views = dataset.train[:1], [shot.view for shot in dataset.train]
     engine = create_engine("auto")
     left = scores.keep_needed(model, seen, views, engine=engine)
     inputs = RasterInputs(seen[0].view, model.splats())

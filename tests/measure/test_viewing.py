@@ -53,16 +53,9 @@ def test_the_field_of_view_is_that_of_the_height():
 @pytest.mark.parametrize(
     "changes",
     [
-        {"target": (0, 0, 0)},
-        {"up": (0, 0, 2)},
-        {"up": (0, 0, 0)},
-        {"eye": (float("nan"), 0, 0)},
-        {"eye": (0, 0)},
-        {"fov_y": 180},
-        {"width": 0},
-        {"height": 0},
-        {"fov_y": 0},
-        {"up": (0, 1)},
+        *({"up": up} for up in ((0, 0, 2), (0, 0, 0), (0, 1))),
+        *({"target": (0, 0, 0)}, {"eye": (float("nan"), 0, 0)}, {"eye": (0, 0)}),
+        *({"fov_y": 180}, {"fov_y": 0}, {"width": 0}, {"height": 0}),
     ],
 )
 def test_a_camera_that_sees_nothing_is_refused(changes):
