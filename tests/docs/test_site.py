@@ -41,14 +41,9 @@ class References(HTMLParser):
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
     folder = tmp_path_factory.mktemp("site")
-    done = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "-d", str(folder)],
-        cwd=ROOT,
-        env=os.environ | {"NO_COLOR": "1"},
-        capture_output=True,
-        text=True,
-        timeout=280,
-    )
+    words = [sys.executable, "-m", "mkdocs", "build", "--strict", "-d", str(folder)]
+    how = {"cwd": ROOT, "env": os.environ | {"NO_COLOR": "1"}, "timeout": 280}
+    done = subprocess.run(words, capture_output=True, text=True, **how)
     assert done.returncode == 0, (done.stdout + done.stderr)[-4000:]
     return folder
 

@@ -62,10 +62,8 @@ def workplace(tmp_path_factory):
     for name, text in hosts:
         (folder / name).write_text(text)
     for name, kind in (("soft", "Soft"), ("blurred", "Blurred")):
-        code = (
-            f"from {name}_3dgs_host import {kind}Host; from pathlib import Path; "
-            f"{kind}Host().write(Path('{name}-3dgs'))"
-        )
+        written = f"{kind}Host().write(Path('{name}-3dgs'))"
+        code = f"from pathlib import Path; from {name}_3dgs_host import {kind}Host; {written}"
         run(folder, shlex.join([sys.executable, "-c", code]))
     for name, _ in hosts:
         (folder / name).unlink()
@@ -80,16 +78,8 @@ def run(folder: Path, command: str) -> str:
         "OMP_WAIT_POLICY": "PASSIVE",
     }
     environment.pop("FRAGPRUNE_HOSTS", None)
-    done = subprocess.run(
-        command,
-        shell=True,
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=280,
-        check=False,
-    )
+    how = {"shell": True, "cwd": folder, "env": environment, "timeout": 280}
+    done = subprocess.run(command, capture_output=True, text=True, **how)
     return done.stdout + done.stderr
 
 
