@@ -21,14 +21,9 @@ from fragprune_vanilla_3dgs import Vanilla3DGS
 
 PARAMETERS = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
 OPTIONS = {
-    "densify_from_iter": 4,
-    "densify_interval": 4,
-    "densify_until_iter": 20,
-    "densify_grad_threshold": 1e-5,
-    "densify_target_lower_bound": 0,
-    "prune_from_iter": 6,
-    "prune_interval": 6,
-    "prune_until_iter": 20,
+    **{"densify_from_iter": 4, "densify_interval": 4, "densify_until_iter": 20},
+    **{"densify_grad_threshold": 1e-5, "densify_target_lower_bound": 0},
+    **{"prune_from_iter": 6, "prune_interval": 6, "prune_until_iter": 20},
 }
 
 
@@ -111,12 +106,10 @@ def test_a_run_may_begin_from_a_ply(stage, begins, photographs, tmp_path):
 
 
 def test_a_script_of_ones_own_runs_with_the_package_answered(tmp_path):
-    script = tmp_path / "mine.py"
-    script.write_text(
-        "from gaussian_splatting.diff_gaussian_rasterization import GaussianRasterizer\n"
-        "assert 'Stand-in' in GaussianRasterizer.__doc__\n"
-    )
-    summary = run(["python", str(script)], RunOptions(device="cpu"))
+    package = "gaussian_splatting.diff_gaussian_rasterization"
+    answered = "assert 'Stand-in' in GaussianRasterizer.__doc__\n"
+    (tmp_path / "mine.py").write_text(f"from {package} import GaussianRasterizer\n{answered}")
+    summary = run(["python", str(tmp_path / "mine.py")], RunOptions(device="cpu"))
     assert (summary.adapter, summary.steps) == ("gaussian-splatting", 0)
 
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -57,9 +58,7 @@ def test_stage_two_follows_the_training_in_one_longer_run(release, train, tmp_pa
     assert (summary.steps, len(summary.curves)) == (MORE, MORE)
     first, last = checkpoint(out, TOTAL), checkpoint(out, TOTAL + MORE)
     assert (summary.model_before, summary.model_after) == (first, last)
-    assert {path.name for path in out.glob("ckpts/*.pt")} == {
-        path.name for path in (checkpoint(out, 3), first, last)
-    }
+    assert {*out.glob("ckpts/*.pt")} == {checkpoint(out, 3), first, last}
     assert summary.fragments_after < summary.fragments_before
     before, after = (torch.load(path)["splats"] for path in (first, last))
     assert len(before["means"]) == len(after["means"]) != 60  # refined until then, not since
@@ -89,19 +88,14 @@ def test_an_evaluation_draws_with_the_thresholds_beside_its_checkpoint(release, 
         assert train("--ckpt", last).steps == 0
         seen.append(evaluated(out, TOTAL + MORE)["mean"])
     assert seen[0] < seen[1]  # what is truncated is missing on black
-
-
-def test_the_thresholds_of_another_checkpoint_are_refused(train, tmp_path):
     train()
-    last = checkpoint(tmp_path / "out", TOTAL + MORE)
-    shutil.copy(checkpoint(tmp_path / "out", TOTAL), last)
+    shutil.copy(checkpoint(out, TOTAL), last)
     with pytest.raises(SidecarError, match="another"):
         train("--ckpt", last)
 
 
 def test_the_control_has_a_folder_of_its_own(train, tmp_path):
-    settings = Settings(iterations=MORE, goal=Control())
-    summary = train(settings=settings)
+    summary = train(settings=Settings(iterations=MORE, goal=Control()))
     assert summary.model_after == checkpoint(tmp_path / "out" / "control", TOTAL + MORE)
     assert sidecar.load(summary.model_after, summary.gaussians)[0].neutral
 
@@ -115,21 +109,19 @@ def test_joint_learning_begins_where_refinement_ends(train, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "named"),
+    "words",
     [
-        (["--steps-scaler", "0.5"], "steps-scaler"),
-        (["--compression", "png"], "compression"),
-        (["--camera_model=fisheye"], "camera-model"),
-        (["--with_ut", "--packed"], "with-ut"),
-        (["--strategy.absgrad"], "absgrad"),
-        (["--app_opt"], "app-opt"),
+        *("--steps-scaler 0.5", "--compression png", "--camera_model=fisheye"),
+        *("--with_ut --packed", "--strategy.absgrad", "--app_opt"),
     ],
 )
-def test_flags_that_stage_two_cannot_follow_are_refused(words, named):
+def test_flags_that_stage_two_cannot_follow_are_refused_before_the_training(words, train, tmp_path):
     how = {"stage": "auto", "device": "cpu"}
     adapter.refuse(repo, ["default", "--camera-model", "pinhole", "--steps_scaler=1"], **how)
+    named = re.split(r"[ =]", words)[0].split(".")[-1].strip("-").replace("_", "-")
     with pytest.raises(UsageError, match=named):
-        adapter.refuse(repo, ["default", *words], **how)
+        train(*words.split())
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("device", ["cuda", "cuda:1", "cpu"])
@@ -138,12 +130,6 @@ def test_absolute_gradients_are_for_strategies_that_run_on_a_gpu_before_stage_tw
     fine = device != "cpu" and stage != "joint"
     with contextlib.nullcontext() if fine else pytest.raises(UsageError, match="absgrad"):
         adapter.refuse(repo, ["default", "--strategy.absgrad"], stage=stage, device=device)
-
-
-def test_they_are_refused_before_the_training(train, tmp_path):
-    with pytest.raises(UsageError, match="compression"):
-        train("--compression", "png")
-    assert not (tmp_path / "out").exists()
 
 
 def test_what_the_script_reads_is_known_where_it_leaves_the_world_as_it_is():
@@ -177,13 +163,10 @@ def test_its_models_are_measured_as_the_script_draws_them(words, factor):
         adapter.drawing(repo, ["default", "--far-plane=9"])
 
 
-def test_it_cannot_resume_and_says_how_to_learn(train):
+def test_it_neither_resumes_nor_learns_on_several_gpus(train, monkeypatch):
     with pytest.raises(UsageError, match="from-iter"):
         train(stage="finetune")
-
-
-def test_several_gpus_would_be_processes_without_thresholds(train, monkeypatch):
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)  # processes without thresholds
     with pytest.raises(EngineError, match="CUDA_VISIBLE_DEVICES"):
         train()
 
