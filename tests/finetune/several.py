@@ -8,6 +8,7 @@ import tempfile
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -84,28 +85,19 @@ def launch(size: int, work: Callable[[int], Any]) -> list[Ended]:
         pytest.skip(f"several processes need torch {OLDEST}")
     read, write = os.pipe()
     agent = _forked(lambda: _keep_store(write))
+    given = {"WORLD_SIZE": str(size), "MASTER_ADDR": "localhost", "MASTER_PORT": ""}
+    given |= {"TORCHELASTIC_USE_AGENT_STORE": "True", "TORCHELASTIC_RESTART_COUNT": "0"}
     try:
-        port = os.read(read, 16).decode()
+        given["MASTER_PORT"] = os.read(read, 16).decode()
         with tempfile.TemporaryDirectory() as folder:
-
-            def rank_of(rank: int) -> Callable[[], None]:
-                def one() -> None:
-                    os.environ |= {
-                        "RANK": str(rank),
-                        "LOCAL_RANK": str(rank),
-                        "WORLD_SIZE": str(size),
-                        "MASTER_ADDR": "localhost",
-                        "MASTER_PORT": port,
-                        "TORCHELASTIC_USE_AGENT_STORE": "True",
-                        "TORCHELASTIC_RESTART_COUNT": "0",
-                    }
-                    torch.save(work(rank), Path(folder) / str(rank))
-
-                return one
-
-            children = [_forked(rank_of(rank)) for rank in range(size)]
-            codes = [os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) for pid in children]
             files = [Path(folder) / str(rank) for rank in range(size)]
+
+            def one(rank: int) -> None:
+                os.environ |= given | {"RANK": str(rank), "LOCAL_RANK": str(rank)}
+                torch.save(work(rank), files[rank])
+
+            children = [_forked(partial(one, rank)) for rank in range(size)]
+            codes = [os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) for pid in children]
             lefts = [torch.load(f, weights_only=False) if f.exists() else None for f in files]
             return [Ended(code, left) for code, left in zip(codes, lefts, strict=True)]
     finally:

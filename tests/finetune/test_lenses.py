@@ -25,10 +25,8 @@ LENSES = {
 
 def lens(name: str, width: int = WIDTH, height: int = HEIGHT) -> Lens:
     coefficients, fisheye = LENSES[name]
-    scale = width / WIDTH
-    return Lens(
-        width, height, 70 * scale, 72 * scale, 50 * scale, 31 * scale, coefficients, fisheye
-    )
+    numbers = (width / WIDTH * each for each in (70, 72, 50, 31))
+    return Lens(width, height, *numbers, coefficients, fisheye)
 
 
 def bend(x, y, coefficients, fisheye):
@@ -37,8 +35,7 @@ def bend(x, y, coefficients, fisheye):
     if fisheye:
         r = np.sqrt(r2)
         angle = np.arctan(r)
-        k = coefficients
-        series = 1 + k[0] * angle**2 + k[1] * angle**4 + k[2] * angle**6 + k[3] * angle**8
+        series = 1 + sum(k * angle**n for k, n in zip(coefficients, (2, 4, 6, 8), strict=True))
         scale = np.where(r > 1e-9, angle * series / np.maximum(r, 1e-9), 1.0)
         return x * scale, y * scale
     k1, k2, p1, p2, k3, k4, k5, k6 = coefficients
@@ -59,6 +56,11 @@ def pixels(fx, fy, cx, cy):
     return (u - cx) / fx, (v - cy) / fy
 
 
+def seen(camera):
+    """``world`` by a pinhole camera."""
+    return world(*pixels(camera.fx, camera.fy, camera.cx, camera.cy))
+
+
 def bent(of: Lens):
     """The photograph of ``world``: rays found by iteration, without OpenCV."""
     want = pixels(of.fx, of.fy, of.cx, of.cy)
@@ -76,11 +78,10 @@ def test_a_straightened_photograph_is_what_its_pinhole_camera_sees(name):
     of = lens(name)
     camera = of.camera(EYE, ORIGIN)
     found = of.straighten(bent(of), camera)
-    want = world(*pixels(camera.fx, camera.fy, camera.cx, camera.cy))
     # 1.5 grey levels: two roundings, and linear interpolation of a picture that bends by at most
     # 60 (4 / 60)^2 / 8 = 0.03 between pixels. The photograph as it is differs by more.
-    assert abs(found[..., 0] - want).max() < 1.5
-    assert abs(bent(of)[..., 0] - want).max() > 5
+    assert abs(found[..., 0] - seen(camera)).max() < 1.5
+    assert abs(bent(of)[..., 0] - seen(camera)).max() > 5
 
 
 def test_a_straight_lens_needs_no_opencv(monkeypatch):
@@ -107,35 +108,31 @@ def write_photographs(folder, of: Lens, size=(WIDTH, HEIGHT)):
 def assert_straight(shot, of: Lens):
     """A photograph is what the pinhole camera of its lens sees."""
     camera = of.camera(EYE, ORIGIN)
-    want = world(*pixels(camera.fx, camera.fy, camera.cx, camera.cy))
     assert shot.view.tan_fov_x == pytest.approx(WIDTH / (2 * camera.fx))
-    assert abs(255 * shot.image[0].numpy() - want).max() < 1.5
+    assert abs(255 * shot.image[0].numpy() - seen(camera)).max() < 1.5
 
 
 @pytest.mark.parametrize(
-    ("model", "numbers", "fy", "coefficients"),
+    ("model", "focal", "bends"),
     [
-        ("SIMPLE_RADIAL", "70 50 31 -0.12", 70, (-0.12, 0, 0, 0, 0, 0, 0, 0)),
-        ("RADIAL", "70 50 31 -0.12 0.01", 70, (-0.12, 0.01, 0, 0, 0, 0, 0, 0)),
-        (
-            *("OPENCV", "70 72 50 31 -0.1 0.02 0.004 -0.003"),
-            *(72, (-0.1, 0.02, 0.004, -0.003, 0, 0, 0, 0)),
-        ),
-        (
-            *("FULL_OPENCV", "70 72 50 31 0.1 -0.02 0.002 0.001 0.01 0.2 0.01 0.0"),
-            *(72, (0.1, -0.02, 0.002, 0.001, 0.01, 0.2, 0.01, 0)),
-        ),
-        ("SIMPLE_RADIAL_FISHEYE", "70 50 31 0.03", 70, (0.03, 0, 0, 0)),
-        ("RADIAL_FISHEYE", "70 50 31 0.03 -0.01", 70, (0.03, -0.01, 0, 0)),
-        ("OPENCV_FISHEYE", "70 72 50 31 0.03 -0.01 0.002 0.0", 72, (0.03, -0.01, 0.002, 0)),
+        ("SIMPLE_RADIAL", (70,), (-0.12,)),
+        ("RADIAL", (70,), (-0.12, 0.01)),
+        ("OPENCV", (70, 72), (-0.1, 0.02, 0.004, -0.003)),
+        ("FULL_OPENCV", (70, 72), (0.1, -0.02, 0.002, 0.001, 0.01, 0.2, 0.01, 0.0)),
+        ("SIMPLE_RADIAL_FISHEYE", (70,), (0.03,)),
+        ("RADIAL_FISHEYE", (70,), (0.03, -0.01)),
+        ("OPENCV_FISHEYE", (70, 72), (0.03, -0.01, 0.002, 0.0)),
     ],
 )
-def test_colmaps_lens_models(tmp_path, model, numbers, fy, coefficients):
-    of = Lens(WIDTH, HEIGHT, 70, fy, 50, 31, coefficients, "FISHEYE" in model)
+def test_colmaps_lens_models(tmp_path, model, focal, bends):
+    fisheye = "FISHEYE" in model
+    coefficients = (*bends, *[0.0] * 8)[: 4 if fisheye else 8]
+    of = Lens(WIDTH, HEIGHT, 70, focal[-1], 50, 31, coefficients, fisheye)
     write_photographs(tmp_path / "images", of)
     sparse = tmp_path / "sparse" / "0"
     sparse.mkdir(parents=True)
-    (sparse / "cameras.txt").write_text(f"1 {model} {WIDTH} {HEIGHT} {numbers}\n")
+    numbers = " ".join(map(str, (WIDTH, HEIGHT, *focal, 50, 31, *bends)))
+    (sparse / "cameras.txt").write_text(f"1 {model} {numbers}\n")
     rows = [f"{i + 1} 1 0 0 0 {i / 10} 0 0 1 view{i}.png\n\n" for i in range(9)]
     (sparse / "images.txt").write_text("".join(rows))
     assert_straight(load_dataset(tmp_path).train[0], of)
@@ -161,13 +158,11 @@ def test_nerfstudios_file_straightens_with_each_frames_own_lens(tmp_path, named)
     assert second.view.tan_fov_y == pytest.approx(HEIGHT / (2 * 72))
 
 
-def test_smaller_images_are_straightened_by_the_same_lens(tmp_path):
+def test_smaller_images_are_straightened_by_the_same_lens():
     large, small = lens("opencv", 2 * WIDTH, 2 * HEIGHT), lens("opencv")
     camera = large.camera(EYE, ORIGIN)
     found = large.straighten(bent(small), camera)  # images_2 of the same photographs
-    seen = camera.resized(WIDTH, HEIGHT)
-    want = world(*pixels(seen.fx, seen.fy, seen.cx, seen.cy))
-    assert abs(found[..., 0] - want).max() < 1.5
+    assert abs(found[..., 0] - seen(camera.resized(WIDTH, HEIGHT))).max() < 1.5
 
 
 @pytest.mark.parametrize("wrong", [(0.1,), (math.nan,) + (0.0,) * 7, (1e9,) + (0.0,) * 7])

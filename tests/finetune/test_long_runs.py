@@ -43,12 +43,8 @@ def learn_for(steps: int, folder: Path) -> tuple[list[StepStats], list[tuple[int
             return super().at(step)
 
     settings = Settings(iterations=steps, train="opacity", goal=Pressure(1e-3))
-    result = finetune(
-        tiny.perturbed(truth),
-        tiny.dataset_in_memory(folder, truth),
-        settings,
-        schedule=Looking(settings),
-    )
+    model, dataset = tiny.perturbed(truth), tiny.dataset_in_memory(folder, truth)
+    result = finetune(model, dataset, settings, schedule=Looking(settings))
     return list(result.curves), looks, result
 
 

@@ -9,8 +9,7 @@ import torch
 from finetune import tiny
 from torch.optim.optimizer import register_optimizer_step_post_hook
 
-from fragprune_plugins import Control, Faster, Portable, Pressure, ThresholdStore, finetune
-from fragprune_plugins.adapting import RasterInputs
+from fragprune_plugins import Control, Faster, Portable, Pressure, ThresholdStore, finetune, measure
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import AlignmentError, DivergedError, EngineError, UsageError
 from fragprune_plugins.learning.schedule import Schedule, Settings
@@ -109,17 +108,6 @@ def test_every_optimizer_steps_in_the_fused_kernel(model, dataset):
     assert all(seen)
 
 
-def mean_fragments(model, shots, engine):
-    """Drawn fragments per pixel, averaged over views."""
-    drawn = [
-        engine.rasterize(
-            RasterInputs(shot.view, model.splats(), planes=(), stop=model.stop), model.falloff
-        )
-        for shot in shots
-    ]
-    return sum(float(each.fragments_per_pixel) for each in drawn) / len(drawn)
-
-
 def test_loss_falls_and_fragments_fall(default, model, dataset):
     passed = len(dataset.train)  # views differ more than steps do
     first, last = (
@@ -127,9 +115,9 @@ def test_loss_falls_and_fragments_fall(default, model, dataset):
         for part in (default.curves[:passed], default.curves[-passed:])
     )
     assert last < first
-    engine = create_engine("auto")
-    before = mean_fragments(model, dataset.test, engine)
-    after = mean_fragments(default.model, dataset.test, engine)
+    before, after = (
+        measure(each, dataset, repeats=1)["fragments_per_pixel"] for each in (model, default.model)
+    )
     assert after < 0.9 * before
     assert default.progress.speedup == pytest.approx(before / after, rel=0.1)
     assert default.progress.steps == 60
@@ -139,13 +127,9 @@ def test_loss_falls_and_fragments_fall(default, model, dataset):
 
 @pytest.mark.parametrize("goal", [Control(), Pressure(1e-3)])
 def test_what_dropout_leaves_out_counts_before_learning(model, dataset, goal):
-    before = [
-        finetune(
-            model, dataset, Settings(iterations=1, goal=goal, dropout=share)
-        ).progress.fragments_before
-        for share in (None, 0.5)
-    ]
-    assert before[0] == before[1]
+    whole, part = (Settings(iterations=1, goal=goal, dropout=share) for share in (None, 0.5))
+    before = finetune(model, dataset, whole).progress.fragments_before
+    assert finetune(model, dataset, part).progress.fragments_before == before
 
 
 def test_same_seed_same_result_and_global_streams_untouched(default, model, dataset):
@@ -211,13 +195,8 @@ def test_gradients_that_are_not_finite_stop_their_step(model, dataset, monkeypat
 
     def drawing(run, shot):
         if run.done == 4:
-            run.model.opacity.register_hook(
-                lambda gradient: (
-                    torch.cat([torch.full((rows, 1), bad), gradient[rows:]])
-                    if run.done == 4
-                    else gradient
-                )
-            )
+            spoiled = torch.full((rows, 1), bad)
+            run.model.opacity.register_hook(lambda each: torch.cat([spoiled, each[rows:]]))
         return draw(run, shot)
 
     monkeypatch.setattr(loop.Training, "_draw", drawing)

@@ -13,7 +13,7 @@ from plyfile import PlyData, PlyElement
 
 from fragprune_plugins.adapting import InputError, Model, ModelFileError
 from fragprune_plugins.constants import NEUTRAL_LOGIT
-from fragprune_plugins.files.ply import expect_drawable, read_ply
+from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.workbench.models.formats.ply import write_ply
 
 
@@ -80,9 +80,14 @@ def test_ascii_doubles_and_unknown_elements(tmp_path):
     assert same(model, read_ply(tmp_path / "foreign.ply"))
 
 
+def changed(change):
+    """Writes a file again with other columns."""
+    return lambda path: write_columns(path, change(columns(path)))
+
+
 def with_column(path: Path, name: str) -> Path:
     write_ply(path, tiny.random_model(4, degree=1))
-    write_columns(path, columns(path) | {name: np.zeros(4)})
+    changed(lambda given: given | {name: np.zeros(4)})(path)
     return path
 
 
@@ -112,28 +117,25 @@ def test_a_column_that_is_ignored_is_named_once(tmp_path, name, caplog):
     assert [name in record.message for record in caplog.records] == [True]
 
 
-def test_a_model_of_surfels_is_read_only_by_who_asks_for_it_and_written_as_it_was(tmp_path):
-    round_ones = tiny.random_model(4, degree=1)
-    model = replace(round_ones, scaling=round_ones.scaling[:, :2])
+@pytest.mark.parametrize(
+    ("change", "said", "last"),
+    [
+        ({"scaling": torch.zeros(4, 2)}, r"two scales.*2D Gaussian Splatting", "scale_1"),
+        ({"filter_3d": torch.rand(4, 1)}, "Mip-Splatting model", "filter_3D"),
+    ],
+)
+def test_what_is_drawn_otherwise_is_read_by_who_asks_for_it_and_written_as_it_was(
+    tmp_path, change, said, last
+):
+    model = replace(tiny.random_model(4, degree=1), **change)
     write_ply(tmp_path / "m.ply", model)
-    scales = [name for name in columns(tmp_path / "m.ply") if name.startswith("scale")]
-    assert scales == ["scale_0", "scale_1"]
-    with pytest.raises(ModelFileError, match=r"two scales.*2D Gaussian Splatting"):
+    names = [name for name in columns(tmp_path / "m.ply") if not name.startswith("rot")]
+    assert names[-1] == last
+    with pytest.raises(ModelFileError, match=said):
         read_ply(tmp_path / "m.ply")
     read = read_ply(tmp_path / "m.ply", filtered=True)
     assert same(model, read)
-    assert read.splats().flat
-    assert not round_ones.splats().flat
-
-
-def test_a_filtered_model_is_read_only_by_who_asks_for_it_and_written_as_it_was(tmp_path):
-    model = tiny.random_model(4, degree=1)
-    model = replace(model, filter_3d=torch.rand(4, 1))
-    write_ply(tmp_path / "m.ply", model)
-    with pytest.raises(ModelFileError, match="Mip-Splatting model"):
-        read_ply(tmp_path / "m.ply")
-    assert same(model, read_ply(tmp_path / "m.ply", filtered=True))
-    assert list(columns(tmp_path / "m.ply"))[-1] == "filter_3D"
+    assert read.splats().flat == ("scaling" in change)
 
 
 def test_a_3d_filter_widens_every_axis_and_keeps_what_the_gaussian_covers(tmp_path):
@@ -179,9 +181,8 @@ def test_opacities_of_0_and_1_and_scales_of_0_are_read_as_such(tmp_path, name, v
 def test_rows_of_an_unpruned_model_that_were_merged_in_are_not_cut(tmp_path):
     """Whoever merges two PLYs fills a column that one of them lacks with 0."""
     write_ply(tmp_path / "m.ply", tiny.cut(tiny.random_model(4), 0.3))
-    given = columns(tmp_path / "m.ply")
-    given["trunc_threshold"][2:] = 0
-    write_columns(tmp_path / "m.ply", given)
+    column = np.array([0.3, 0.3, 0, 0])
+    changed(lambda given: given | {"trunc_threshold": column})(tmp_path / "m.ply")
     read = read_ply(tmp_path / "m.ply")
     assert read.falloff[:2].tolist() == pytest.approx([0.3, 0.3])
     assert (read.thresholds.logits[2:] <= NEUTRAL_LOGIT).all()
@@ -196,30 +197,24 @@ def test_colours_without_sh_are_named_with_who_writes_them(tmp_path):
 
 
 def without(*names):
-    return lambda path: write_columns(
-        path, {name: each for name, each in columns(path).items() if name not in names}
-    )
-
-
-def outside(path):
-    """Put thresholds into a column, one of them above 1."""
-    write_columns(path, columns(path) | {"trunc_threshold": np.linspace(0.5, 1.2, 8)})
+    return changed(lambda given: {n: each for n, each in given.items() if n not in names})
 
 
 BAD = {
     "cut off": (lambda path: path.write_bytes(path.read_bytes()[:-100]), "not readable as PLY"),
-    "points": (
-        without("f_dc_0", "f_dc_1", "f_dc_2", "opacity", "rot_3"),
-        "without f_dc_0, f_dc_1, f_dc_2, opacity, rot_3",
-    ),
+    "points": (without("f_dc_0", "opacity", "rot_3"), "without f_dc_0, opacity, rot_3"),
     "compact": (without("f_dc_0", "f_dc_1", "f_dc_2"), "keeps colours in a network"),
     "odd sh": (without("f_rest_8"), "8 f_rest columns"),
     "faces": (lambda path: PlyData([FACES]).write(path), "without a vertex"),
-    "empty": (
-        lambda path: write_columns(path, {n: each[:0] for n, each in columns(path).items()}),
-        "0 Gaussians",
+    "empty": (changed(lambda given: {n: each[:0] for n, each in given.items()}), "0 Gaussians"),
+    "no numbers": (
+        changed(lambda given: given | {"x": np.full(8, np.nan)}),
+        "NaN .* in 8 of 8 rows",
     ),
-    "thresholds": (outside, "trunc_threshold outside"),
+    "thresholds": (
+        changed(lambda given: given | {"trunc_threshold": np.linspace(0.5, 1.2, 8)}),
+        "trunc_threshold outside",
+    ),
 }
 
 
@@ -233,14 +228,12 @@ def test_bad_files_are_refused_by_name(tmp_path, how):
     assert error.value.where == str(path)
 
 
-def test_shapes_are_checked():
-    model = tiny.random_model(4)
-    with pytest.raises(InputError, match="opacity"):
-        replace(model, opacity=model.opacity[:, 0])
-    with pytest.raises(InputError, match="filter_3d"):
-        replace(model, filter_3d=torch.full((3, 1), 0.5))
-    with pytest.raises(InputError, match="f_rest"):
-        replace(model, f_rest=torch.zeros(4, 5, 3))
+@pytest.mark.parametrize(
+    ("name", "shape"), [("opacity", (4,)), ("filter_3d", (3, 1)), ("f_rest", (4, 5, 3))]
+)
+def test_shapes_are_checked(name, shape):
+    with pytest.raises(InputError, match=name):
+        replace(tiny.random_model(4), **{name: torch.full(shape, 0.5)})
 
 
 def test_kept_rows_stay_in_their_order_with_all_that_they_have():
@@ -254,11 +247,3 @@ def test_kept_rows_stay_in_their_order_with_all_that_they_have():
         assert torch.equal(getattr(kept, name), each[mask])
     assert torch.equal(kept.falloff, model.falloff[mask])
     assert tiny.random_model(6).keep(mask).thresholds is None
-
-
-def test_a_value_that_cannot_be_drawn_names_the_file(tmp_path):
-    model = tiny.random_model(4)
-    model.opacity[2] = torch.nan
-    with pytest.raises(ModelFileError, match="opacity") as stated:
-        expect_drawable(tmp_path / "a.spz", model)
-    assert stated.value.where == str(tmp_path / "a.spz")

@@ -73,30 +73,23 @@ def test_the_file_has_no_thresholds_and_takes_the_sidecar_of_an_earlier_one_away
     assert set(profile["columns"]) == {"untruncated"}
 
 
-@pytest.mark.parametrize("more", [(), ("--keep", "visible")])
-def test_the_record_has_the_area_of_both(scene, tmp_path, more):
+@pytest.mark.parametrize(
+    ("more", "target"),
+    [((), "photographs"), (("--keep", "visible"), "photographs"), (("--self",), "itself")],
+)
+def test_the_record_has_the_area_of_both(scene, tmp_path, more, target):
     data, path, model = scene
     out = tmp_path / "out.ply"
     words = ("--data", data, "--out", out, "--iters", 30, "--portable", "--pressure", 1e-2)
     report = run_json("finetune", path, *words, *more)
-    learned = fp.load(out)
     dataset = fp.load_dataset(data)
-    for side, splat in (("before", model), ("after", learned)):
+    for side, splat in (("before", model), ("after", fp.load(out))):
         assert report[side]["area_per_pixel"] == pytest.approx(area(splat, dataset), rel=1e-6)
+        assert report[side]["target"] == target
     assert report["after"]["area_per_pixel"] < report["before"]["area_per_pixel"]
+    assert report["after"]["psnr"] > 20
     assert report["untruncated"] is None
     assert report["settings"]["goal"] == "portable=0.01"
-
-
-def test_without_photographs(scene, tmp_path):
-    data, path, _ = scene
-    out = tmp_path / "out.ply"
-    words = ("--self", "--data", data, "--out", out, "--iters", 40, "--portable")
-    report = run_json("finetune", path, *words, "--pressure", 3e-3)
-    assert report["target"] == "itself"
-    assert report["after"]["area_per_pixel"] < report["before"]["area_per_pixel"]
-    assert report["after"]["psnr"] > 25
-    assert not sidecar.path_beside(out).exists()
 
 
 def test_a_model_with_thresholds_is_refused(scene):

@@ -37,14 +37,18 @@ def require_same(one, other):
     assert one[1:] == other[1:]
 
 
-@pytest.mark.parametrize(("case", "moving"), [*((c, ()) for c in CASES), ("all", (41, 3, 5))])
-def test_two_processes_learn_what_one_does_with_as_many_views_to_the_bit(
-    model, dataset, case, moving
+@pytest.mark.parametrize(
+    ("size", "case", "moving"),
+    [*((2, case, ()) for case in CASES), (2, "all", (41, 3, 5)), (4, "two views each", ())],
+)
+def test_processes_are_replicas_and_learn_what_one_does_with_as_many_views(
+    model, dataset, size, case, moving
 ):
     settings = CASES[case]
     whole = learned(model, dataset, settings, moving=moving)
-    first, second = learn(2, lambda ranks: learned(model, dataset, settings, ranks, moving))
-    require_same(first, second)
+    first, *others = learn(size, lambda ranks: learned(model, dataset, settings, ranks, moving))
+    for other in others:
+        require_same(first, other)
     if settings.views_per_step == 2:  # a + b is b + a
         require_same(whole, first)
     else:  # (a + c) + (b + d) is not ((a + b) + c) + d in its last bits
@@ -55,15 +59,6 @@ def require_near(one, other):
     """Equal but for the order in which gradients were summed, in float32: a few last bits."""
     for name, tensor in one[0].items():
         assert torch.allclose(tensor, other[0][name], rtol=1e-6, atol=1e-6), name
-
-
-def test_four_processes_are_replicas_and_near_one_with_four_views(model, dataset):
-    settings = Settings(iterations=STEPS, views_per_step=4)
-    whole = learned(model, dataset, settings)
-    first, *others = learn(4, lambda ranks: learned(model, dataset, settings, ranks))
-    for other in others:
-        require_same(first, other)
-    require_near(whole, first)
 
 
 def test_a_view_more_a_step_costs_no_step_more(model, dataset):
@@ -92,33 +87,29 @@ def messages(errors):
     return [error.text for error in errors]
 
 
-def test_processes_with_other_photographs_are_refused_before_a_step(model, dataset):
-    def work(ranks):
-        mine = replace(dataset, train=dataset.train[ranks.rank :])
-        return learned(model, mine, Settings(iterations=4, views_per_step=2), ranks)
-
-    one, other = messages(learn(2, work))
-    assert "process 1 of 2 with other photographs than process 0" in one
-    assert one == other
-
-
-def test_a_process_that_does_not_see_the_checkpoint_is_noticed(model, dataset, tmp_path):
+@pytest.mark.parametrize("what", ["photographs", "checkpoint"])
+def test_processes_with_other_files_are_refused_before_a_step(model, dataset, tmp_path, what):
     settings = Settings(iterations=4, views_per_step=2)
-    kept = Checkpoints(tmp_path / "0", None, 2)
-    finetune(model, dataset, settings, engine="cpu", checkpoints=kept)
+    given = {"engine": "cpu", "settings": settings}
+    if what == "checkpoint":  # the first process alone sees it
+        finetune(model, dataset, checkpoints=Checkpoints(tmp_path / "0", None, 2), **given)
 
     def work(ranks):
+        other = what == "photographs"
+        mine = replace(dataset, train=dataset.train[ranks.rank :]) if other else dataset
         own = Checkpoints(tmp_path / str(ranks.rank), None, 2)
-        return finetune(model, dataset, settings, engine="cpu", checkpoints=own, ranks=ranks)
+        return finetune(model, mine, checkpoints=own, ranks=ranks, **given)
 
     one, other = messages(learn(2, work))
-    assert "process 1 of 2 with other checkpoint than process 0" in one
+    assert f"process 1 of 2 with other {what} than process 0" in one
     assert one == other
     assert not (tmp_path / "1").exists()
 
 
 def test_replicas_that_part_are_noticed_and_named(model, dataset, monkeypatch):
     monkeypatch.setattr(processes, "_COMPARE", 4)
+
+    settings = Settings(iterations=9, views_per_step=2, goal=Control())
 
     def work(ranks):
         real = torch.optim.Adam.step
@@ -129,9 +120,7 @@ def test_replicas_that_part_are_noticed_and_named(model, dataset, monkeypatch):
                 optimizer.param_groups[0]["params"][0].data[3] += 1e-6  # one number's last bits
 
         torch.optim.Adam.step = step
-        return learned(
-            model, dataset, Settings(iterations=9, views_per_step=2, goal=Control()), ranks
-        )
+        return learned(model, dataset, settings, ranks)
 
     one, other = messages(learn(2, work))
     assert "after step 4: process 1 of 2 with other opacity than process 0" in one
@@ -189,8 +178,7 @@ def test_a_fingerprint_knows_every_bit(numbers, place, bit):
     tensor = torch.tensor(numbers)
     other = tensor.clone()
     other.view(torch.int32)[place % len(numbers)] ^= -(2**31) if bit == 31 else 1 << bit
-    assert fingerprint(tensor) == fingerprint(tensor.clone())
-    assert fingerprint(tensor) != fingerprint(other)
+    assert fingerprint(other) != fingerprint(tensor) == fingerprint(tensor.clone())
 
 
 def test_a_fingerprint_knows_the_order_across_pieces(monkeypatch):
@@ -233,11 +221,8 @@ with open(f"{sys.argv[1]}/{ranks.rank}", "w") as file:
 def test_an_old_torch_is_refused_before_it_can_wait_without_end(monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "2")
     monkeypatch.setattr(torch, "__version__", "2.4.1")
-    with (
-        pytest.raises(RanksError, match=r"torch 2\.4\.1; expected 2\.5"),
-        joined(torch.device("cpu")),
-    ):
-        pass
+    with pytest.raises(RanksError, match=r"torch 2\.4\.1; expected 2\.5"):
+        joined(torch.device("cpu")).__enter__()
 
 
 @needs_processes

@@ -1,6 +1,7 @@
 """A fine-tuning that was cut off goes on, and ends with the same bits as one that was not."""
 
 import json
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -53,37 +54,23 @@ def warming_up(patch):
     patch.setattr(schedule, "_LEARNING_STEPS", 4)
 
 
-@pytest.mark.parametrize(
-    ("settings", "prepare", "rows"),
-    [
-        (Settings(iterations=STEPS), None, None),
-        (Settings(iterations=STEPS, train="opacity", goal=Pressure(1e-3)), None, None),
-        (Settings(iterations=STEPS, dropout=0.2), None, None),
-        (Settings(iterations=STEPS), None, [41, 3, 5]),
-        (Settings(iterations=STEPS, train="appearance", goal=Fewer(1.5)), None, None),
-        (Settings(iterations=STEPS, goal=Control(), seed=3), None, None),
-        (Settings(iterations=STEPS, goal=Portable()), None, None),
-        (Settings(iterations=STEPS), warming_up, None),
-        (Settings(iterations=STEPS, goal=Faster(1.2)), tiny.exact_clock, None),
-    ],
-    ids=[
-        "all",
-        "opacity",
-        "dropout",
-        "moving",
-        "target",
-        "control",
-        "portable",
-        "warm-up",
-        "target time",
-    ],
-)
-def test_cut_off_it_ends_as_never_cut(
-    model, dataset, tmp_path, monkeypatch, settings, prepare, rows
-):
-    if prepare:
-        prepare(monkeypatch)
-    moving = {"relocate": rows and torch.tensor(rows)}
+CASES = {
+    **{"all": {}, "moving": {}, "warm-up": {}, "dropout": {"dropout": 0.2}},
+    "opacity": {"train": "opacity", "goal": Pressure(1e-3)},
+    "target": {"train": "appearance", "goal": Fewer(1.5)},
+    "control": {"goal": Control(), "seed": 3},
+    "portable": {"goal": Portable()},
+    "target time": {"goal": Faster(1.2)},
+}
+PREPARED = {"warm-up": warming_up, "target time": tiny.exact_clock}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_cut_off_it_ends_as_never_cut(model, dataset, tmp_path, monkeypatch, case):
+    settings = Settings(iterations=STEPS, **CASES[case])
+    if case in PREPARED:
+        PREPARED[case](monkeypatch)
+    moving = {"relocate": torch.tensor([41, 3, 5]) if case == "moving" else None}
     path, told = tmp_path / "out.fragprune-unfinished", []
     whole = run(model, dataset, settings, **moving)
     given = {"tell": told.append, **moving}
@@ -165,12 +152,6 @@ def test_another_configuration_is_refused_and_named(
     assert unfinished.read_bytes() == before
 
 
-def not_finite(path):
-    tensors, values = resuming.read(path, "cpu")
-    tensors["exp_avg.opacity"][3] = torch.nan
-    save_file(tensors, path, metadata={"format": resuming.FORMAT, "values": json.dumps(values)})
-
-
 def tensors(change):
     """Spoil a checkpoint by replacing some of its tensors; None drops one."""
 
@@ -194,11 +175,17 @@ def value(name, word):
     return spoil
 
 
+def not_finite(path):
+    known, values = resuming.read(path, "cpu")
+    known["exp_avg.opacity"][3] = torch.nan
+    save_file(known, path, metadata={"format": resuming.FORMAT, "values": json.dumps(values)})
+
+
 BROKEN = {
+    "not a number": not_finite,
     "cut off": lambda path: path.write_bytes(path.read_bytes()[:-9]),
     "empty": lambda path: path.write_bytes(b""),
     "foreign": lambda path: save_file({"logits": torch.zeros(3)}, path),
-    "not a number": not_finite,
     "a part is missing": tensors(lambda _: {"model.opacity": None}),
     "other rows": tensors(lambda _: {"model.opacity": torch.zeros(3, 1)}),
     "fewer thresholds": tensors(
@@ -228,14 +215,10 @@ def test_a_broken_checkpoint_is_stated(model, dataset, unfinished, tmp_path, how
 
 
 def test_a_full_disk_costs_the_checkpoint_not_the_training(model, dataset, tmp_path, monkeypatch):
+    full = OutputError("x", "cannot be written (No space left on device)", "a place", "Free it.")
     told = []
-
-    def full(*_, **__):
-        raise OutputError("x", "cannot be written (No space left on device)", "a place", "Free it.")
-
-    monkeypatch.setattr(resuming, "replacing", full)
-    path = tmp_path / "out.fragprune-unfinished"
-    result = run(model, dataset, Settings(iterations=4), path, tell=told.append)
+    monkeypatch.setattr(resuming, "replacing", Mock(side_effect=full))
+    result = run(model, dataset, Settings(iterations=4), tmp_path / "out", tell=told.append)
     assert result.progress.steps == 4
     assert "no checkpoint was written" in told[0]
     assert "No space left" in told[0]

@@ -140,21 +140,19 @@ def test_processes_that_call_with_other_arguments_are_told():
 
 
 @pytest.mark.parametrize(
-    "change",
+    ("changed", "splats"),
     [
-        lambda inputs: replace(inputs, means2d_hook=torch.zeros(6, 3)),
-        lambda inputs: replace(inputs, sample_offsets=torch.zeros(tiny.SIDE, tiny.SIDE, 2)),
-        lambda inputs: replace(inputs, scores=True),
-        lambda inputs: replace(inputs, splats=replace(inputs.splats, features=torch.ones(6, 2))),
-        lambda inputs: replace(
-            inputs, splats=replace(inputs.splats, scales=inputs.splats.scales[:, :2])
-        ),
+        ({"means2d_hook": torch.zeros(6, 3)}, {}),
+        ({"sample_offsets": torch.zeros(tiny.SIDE, tiny.SIDE, 2)}, {}),
+        *(({"scores": True}, {}), ({}, {"features": torch.ones(6, 2)})),
+        ({}, {"scales": torch.ones(6, 2)}),
     ],
 )
-def test_what_is_not_sent_is_refused(change):
-    inputs = RasterInputs(tiny.cameras()[0].view(), tiny.random_model(6).splats())
+def test_what_is_not_sent_is_refused(changed, splats):
+    drawn = replace(tiny.random_model(6).splats(), **splats)
+    inputs = RasterInputs(tiny.cameras()[0].view(), drawn, **changed)
     with pytest.raises(InputError, match="divided among processes"):
-        ShardedEngine(create_engine("cpu"), Ranks()).rasterize(change(inputs), None)
+        ShardedEngine(create_engine("cpu"), Ranks()).rasterize(inputs, None)
 
 
 @given(seed=st.integers(0, 10**6), spread=st.floats(0.1, 40), size=st.floats(-6, 3))
@@ -295,10 +293,9 @@ def test_what_is_not_finite_in_one_part_is_nan_in_all_and_other_gradients_stay(n
 
 def test_opacities_low_in_one_part_alone_are_no_reset(model, dataset):
     """A model may be sorted by opacity."""
-    order = model.opacity[:, 0].argsort()
-    sorted_ = replace(
-        model, opacity=model.opacity[order].where(torch.arange(len(model))[:, None] > 20, -6.0)
-    )
+    opacity = model.opacity.sort(dim=0).values
+    opacity[:21] = -6.0
+    sorted_ = replace(model, opacity=opacity)
     settings = Settings(iterations=4, views_per_step=3)
     for each in learn(3, lambda ranks: learned(sorted_, dataset, settings, ranks)):
         assert isinstance(each, tuple), each

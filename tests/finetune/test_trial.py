@@ -11,7 +11,6 @@ from finetune import tiny
 
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.plugins.hookspecs import hookimpl
-from fragprune_plugins.plugins.loading import installed
 from fragprune_plugins.workbench.finetune import trial
 from fragprune_plugins.workbench.finetune.trial import BY_HEART, DROPOUT, KEEP, forgotten
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
@@ -70,7 +69,7 @@ def test_few_photographs_tell_nothing(model, dataset, engine):
     assert forgotten(model, dataset, engine=engine) is None
 
 
-def test_a_trial_leaves_no_trace(model, photographs, engine, request):
+def test_a_trial_leaves_no_trace(model, photographs, engine, plug):
     heard = []
 
     class Observer:
@@ -78,8 +77,7 @@ def test_a_trial_leaves_no_trace(model, photographs, engine, request):
         def fragprune_step(self, stats):
             heard.append(stats)
 
-    request.addfinalizer(lambda: installed().remove("observer"))
-    installed().register(Observer(), "observer")
+    plug(Observer())
     before, state = model.xyz.clone(), torch.random.get_rng_state()
     first = forgotten(model, photographs, engine=engine)
     assert first == forgotten(model, photographs, engine=engine)

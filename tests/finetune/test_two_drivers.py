@@ -63,16 +63,10 @@ CASES = {
 
 
 def photograph(camera, name):
-    view = View(
-        width=camera.image_width,
-        height=camera.image_height,
-        tan_fov_x=math.tan(camera.FoVx / 2),
-        tan_fov_y=math.tan(camera.FoVy / 2),
-        viewmatrix=camera.world_view_transform,
-        projmatrix=camera.full_proj_transform,
-        campos=camera.camera_center,
-        background=torch.zeros(3),
-    )
+    size = {"width": camera.image_width, "height": camera.image_height}
+    lens = {"tan_fov_x": math.tan(camera.FoVx / 2), "tan_fov_y": math.tan(camera.FoVy / 2)}
+    place = {"viewmatrix": camera.world_view_transform, "projmatrix": camera.full_proj_transform}
+    view = View(**size, **lens, **place, campos=camera.camera_center, background=torch.zeros(3))
     return Photograph(name, view, camera.original_image)
 
 

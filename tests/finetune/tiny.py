@@ -15,7 +15,7 @@ import pytest
 import torch
 from PIL import Image
 
-from fragprune_plugins import Model, RasterInputs, ThresholdStore, rasterize
+from fragprune_plugins import Model, ThresholdStore, rasterize
 from fragprune_plugins.workbench.figures import evaluate
 from fragprune_plugins.workbench.finetune import faster, loop
 from fragprune_plugins.workbench.models.formats.ply import write_ply
@@ -67,19 +67,11 @@ def stems(shots: Iterable[Any]) -> list[str]:
 
 def cameras(count: int = 9) -> list[Camera]:
     """On a circle around the origin, looking at it; y is down."""
-    result = []
+    result, half = [], SIDE / 2
     for i in range(count):
-        angle = 2 * math.pi * i / count
-        rotation = torch.tensor(
-            [
-                [math.cos(angle), 0.0, -math.sin(angle)],
-                [0.0, 1.0, 0.0],
-                [math.sin(angle), 0.0, math.cos(angle)],
-            ],
-            dtype=torch.float64,
-        )
+        cos, sin = (turn(2 * math.pi * i / count) for turn in (math.cos, math.sin))
+        rotation = torch.tensor([[cos, 0, -sin], [0, 1, 0], [sin, 0, cos]], dtype=torch.float64)
         translation = torch.tensor([0.0, 0.1, 3.0], dtype=torch.float64)
-        half = SIDE / 2
         result.append(Camera(rotation, translation, SIDE, SIDE, FOCAL, FOCAL, half, half))
     return result
 
@@ -88,26 +80,18 @@ def host_cameras(chosen: list[Camera]) -> list[dict[str, Any]]:
     """The content of the cameras.json that a host writes."""
     return [
         {
-            "id": i,
-            "img_name": f"view{i:02d}",
-            "width": camera.width,
-            "height": camera.height,
-            "position": (-camera.rotation.T @ camera.translation).tolist(),
-            "rotation": camera.rotation.T.tolist(),
-            "fx": camera.fx,
-            "fy": camera.fy,
+            **{"id": i, "img_name": f"view{i:02d}", "width": each.width, "height": each.height},
+            "position": (-each.rotation.T @ each.translation).tolist(),
+            **{"rotation": each.rotation.T.tolist(), "fx": each.fx, "fy": each.fy},
         }
-        for i, camera in enumerate(chosen)
+        for i, each in enumerate(chosen)
     ]
 
 
 def photographs(model: Model) -> list[torch.Tensor]:
     """The model as the cameras see it, (3, H, W) each."""
     with torch.no_grad():
-        return [
-            rasterize(RasterInputs(camera.view(), model.splats())).image.clamp(0, 1)
-            for camera in cameras()
-        ]
+        return [rasterize(model, camera.view()).image.clamp(0, 1) for camera in cameras()]
 
 
 def save_png(path: Path, image: torch.Tensor) -> None:
@@ -178,9 +162,10 @@ def write_blender(folder: Path, images: list[torch.Tensor]) -> Path:
     for part in ("train", "test"):
         chosen = [i for i in range(len(images)) if (i % 8 == 0) == (part == "test")]
         for i in chosen:
-            save_png(folder / part / f"view{i:02d}.png", images[i])
-        names = [f"./{part}/view{i:02d}" for i in chosen]
-        content = transforms(names, [cameras()[i] for i in chosen])
+            save_png(folder / part / f"{NAMES[i]}.png", images[i])
+        content = transforms(
+            [f"./{part}/{NAMES[i]}" for i in chosen], [cameras()[i] for i in chosen]
+        )
         (folder / f"transforms_{part}.json").write_text(json.dumps(content))
     return folder
 
@@ -196,9 +181,8 @@ def scene(folder: Path) -> tuple[Path, Path, Model]:
 
 
 def perturbed(truth: Model) -> Model:
-    stream = torch.Generator().manual_seed(1)
-    noise = 0.7 * torch.randn(truth.opacity.shape, generator=stream)
-    return replace(truth, opacity=truth.opacity + noise)
+    noise = torch.randn(truth.opacity.shape, generator=torch.Generator().manual_seed(1))
+    return replace(truth, opacity=truth.opacity + 0.7 * noise)
 
 
 def cut(model: Model, thresholds: torch.Tensor | float) -> Model:
