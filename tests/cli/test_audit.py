@@ -2,6 +2,7 @@
 
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -83,27 +84,16 @@ def test_as_text_the_result_comes_first_and_tables_fit_a_terminal(model):
 
 
 def test_without_a_folder_there_is_the_table_alone(model, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    report = run_json("audit", model, "--views", 1, "--resolution", 16, "--orbit")
-    assert (report["page"], report["maps"]) == (None, None)
-    assert not list(tmp_path.iterdir())
-
-
-def test_given_cameras_need_no_photographs(model, tmp_path):
-    cameras = tiny.write_path(tmp_path / "cameras.json", tiny.NAMES[:7], tiny.SIDE, tiny.SIDE)
-    given = ("--cameras", cameras, "--views", 3)
-    report = run_json("audit", model, *given, "--out", tmp_path / "out")
-    assert report["cameras"]["kind"] == "given"
-    assert "3 of the 7 cameras" in report["cameras"]["why"]
-    assert {view["width"] for view in report["maps"]["views"]} == {tiny.SIDE}
-
-
-def test_the_command_that_it_advises_takes_the_photographs_that_it_was_given(model, tmp_path):
+    """The command that it advises takes the photographs that it was given."""
     data = tiny.write_blender(tmp_path / "data", tiny.photographs(tiny.random_model()))
-    given = run_json("audit", model, "--data", data, "--views", 1)["pruning"]
-    alone = run_json("audit", model, "--orbit", "--views", 1, "--resolution", 16)["pruning"]
-    assert f"fragprune finetune {model} --data {data} --out pruned.ply." in given
-    assert f"fragprune finetune {model} --self --out pruned.ply. No photographs" in alone
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    alone = run_json("audit", model, "--orbit", "--views", 1, "--resolution", 16)
+    assert (alone["page"], alone["maps"]) == (None, None)
+    assert f"finetune {model} --self --out pruned.ply. No photographs" in alone["pruning"]
+    given = run_json("audit", model, "--data", data, "--views", 1)
+    assert f"fragprune finetune {model} --data {data} --out pruned.ply." in given["pruning"]
+    assert not list(Path().iterdir())
 
 
 def test_the_cameras_of_its_training_are_taken_unless_others_are_asked_for(tmp_path):
@@ -118,16 +108,18 @@ def test_the_cameras_of_its_training_are_taken_unless_others_are_asked_for(tmp_p
     for side in ("orbit", "inside"):
         asked = run_json("audit", run, f"--{side}", "--views", 1, "--resolution", 16, *out)
         assert asked["cameras"]["kind"] == side
+    cameras = tiny.write_path(tmp_path / "cameras.json", tiny.NAMES[:7], tiny.SIDE, tiny.SIDE)
+    report = run_json("audit", run, "--cameras", cameras, "--views", 3, *out)
+    assert "3 of the 7 cameras" in report["cameras"]["why"]
+    assert {view["width"] for view in report["maps"]["views"]} == {tiny.SIDE}
 
 
 def test_a_pruned_model_says_what_its_thresholds_save(tmp_path):
     path = tmp_path / "pruned.ply"
     write_ply(path, tiny.cut(tiny.random_model(), 0.3))
     words = ("audit", path, "--views", 1, "--resolution", 16)
-    report = run_json(*words)
-    assert report["truncated"] is True
+    report, plain = run_json(*words), run_json(*words, "--no-truncation")
+    assert (report["truncated"], plain["truncated"]) == (True, False)
     saved = r"has cutoffs. With them it draws \d\.\d\dx fewer fragments"
     assert re.search(saved, report["pruning"])
-    plain = run_json(*words, "--no-truncation")
-    assert plain["truncated"] is False
     assert plain["fragments_per_pixel"] == report["cuts"][-1]["fragments_per_pixel"]

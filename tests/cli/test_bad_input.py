@@ -3,6 +3,8 @@
 import json
 import os
 from itertools import combinations
+from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -40,82 +42,73 @@ def untouched(out):
     return out.read_bytes() == b"precious" and sidecar.path_beside(out).read_bytes() == b"dear"
 
 
-WRONG = {
-    "model cut off": ("model-file", "not readable as PLY"),
-    "a checkpoint": ("model-file", "(4D models)"),
-    "gsplat's checkpoint": ("model-file", "(4D models)"),
-    "data missing": ("dataset", "no such folder"),
-    "stale sidecar": ("sidecar", "thresholds of another model"),
-}
+def stale(path):
+    sidecar.save(path, ThresholdStore(60))
+    path.write_bytes(path.read_bytes()[:-1] + b"\x01")
+    return path
+
+
+def cut_off(path):
+    path.write_bytes(path.read_bytes()[:-50])
+    return path
 
 
 @pytest.mark.parametrize(
-    ("command", "how"),
+    ("spoiled", "code", "words"),
     [
-        *(("finetune", how) for how in WRONG),
-        *((command, "stale sidecar") for command in ("profile", "render", "compare")),
+        (cut_off, "model-file", "not readable as PLY"),
+        (lambda path: path.rename(path.with_name("chkpnt30.pth")), "model-file", "(4D models)"),
+        (lambda path: path.rename(path.with_name("ckpt_29.pt")), "model-file", "(4D models)"),
+        (lambda path: "x" * 300, "model-file", "cannot be opened (File name too long)"),
+        (stale, "sidecar", "thresholds of another model"),
     ],
 )
-def test_refused(data, path, out, tmp_path, command, how):
+@pytest.mark.parametrize("command", ["finetune", "export"])
+def test_refused(data, path, out, command, spoiled, code, words):
     """What is wrong with files is said by their readers, and tested with them."""
-    code, words = WRONG[how]
-    if how == "model cut off":
-        path.write_bytes(path.read_bytes()[:-50])
-    elif how == "a checkpoint":
-        path = path.rename(path.with_name("chkpnt30.pth"))
-    elif how == "gsplat's checkpoint":
-        path = path.rename(path.with_name("ckpt_29_rank0.pt"))
-    elif how == "data missing":
-        data = tmp_path / "nowhere"
-    else:
-        sidecar.save(path, ThresholdStore(60))
-        path.write_bytes(path.read_bytes()[:-1] + b"\x01")
-    arguments = {
-        "finetune": ("finetune", path, "--data", data, "--out", out, "--iters", 3),
-        "profile": ("profile", path, "--data", data),
-        "render": ("render", path, "--data", data, "--out", tmp_path / "pictures"),
-        "compare": ("compare", path, path, "--data", data),
-    }[command]
-    refused(arguments, code, words)
+    more = ("--data", data) if command == "finetune" else ()
+    refused((command, spoiled(path), "--out", out, *more), code, words)
     assert untouched(out)
-
-
-def test_unwritable_output_is_refused_before_learning(data, path, out, tmp_path, monkeypatch):
-
-    monkeypatch.setattr("fragprune_plugins.workbench.finetune.api.finetune", None)  # never called
-    inside = out / "below-a-file.ply"
-    refused(("finetune", path, "--data", data, "--out", inside), "output", "cannot be written")
-    folder = tmp_path / "folder.ply"
-    folder.mkdir()
-    refused(("finetune", path, "--data", data, "--out", folder), "output", "a folder")
-    os.mkfifo(pipe := tmp_path / "pipe.ply")
-    refused(("finetune", path, "--data", data, "--out", pipe), "output", "a pipe")
-    assert untouched(out)
-    assert pipe.is_fifo()
 
 
 @pytest.mark.parametrize(
     ("more", "said"),
-    [((), ("dataset", "view00.png: not readable")), (("--resolution", 4), ("input", "8x8 pixels"))],
+    [
+        (("--data", "nowhere"), ("dataset", "no such folder")),
+        ((), ("dataset", "view00.png: not readable")),
+        (("--resolution", 4), ("input", "8x8 pixels")),
+        (("--out", "{out}/below-a-file.ply"), ("output", "cannot be written")),
+        (("--out", "folder.ply"), ("output", "a folder")),
+        (("--out", "pipe.ply"), ("output", "a pipe")),
+    ],
 )
-def test_what_cannot_be_measured_is_refused_before_learning(
-    data, path, out, monkeypatch, more, said
+def test_what_cannot_end_well_is_refused_before_learning(
+    data, path, out, tmp_path, monkeypatch, more, said
 ):
     monkeypatch.setattr("fragprune_plugins.workbench.finetune.api.finetune", None)  # never called
+    monkeypatch.chdir(tmp_path)
+    Path("folder.ply").mkdir()
+    os.mkfifo("pipe.ply")
     if not more:
         held_out = data / "images" / "view00.png"
         held_out.write_bytes(held_out.read_bytes()[:-100])
+    more = [str(word).format(out=out) for word in more]
     refused(("finetune", path, "--data", data, "--out", out, *more), *said)
     assert untouched(out)
+    assert Path("pipe.ply").is_fifo()
 
 
-@pytest.mark.parametrize("command", ["finetune", "export"])
-def test_the_model_itself_is_no_output(data, path, command):
+@pytest.mark.parametrize(
+    ("command", "more"), [("finetune", ["--data"]), ("export", []), ("export", ["returned"])]
+)
+def test_the_model_itself_is_no_output(data, path, tmp_path, command, more):
     write_ply(path, tiny.cut(tiny.random_model(8), 0.3))
+    write_ply(tmp_path / "edited.ply", tiny.random_model(8))
     before = path.read_bytes()
-    more = ("--data", data) if command == "finetune" else ()
+    given = {"--data": (path, "--data", data), "returned": (tmp_path / "edited.ply", path)}
     for out in (path, path.with_suffix(".PLY")):  # one sidecar for both
-        fails(command, path, *more, "--out", out, says="the model's name")
+        words = given[more[0]] if more else (path,)
+        fails(command, *words, "--out", out, says="the model's name")
     assert path.read_bytes() == before
 
 
@@ -159,6 +152,7 @@ OUT_OF_RANGE = {
         (f"{FINETUNE} --self --data d --cameras c", "--data with --cameras"),
         (f"{FINETUNE} --cameras c", "--cameras without --self"),
         (FINETUNE, "Pass --data FOLDER with photographs"),
+        ("compare FILE FILE", "no record"),
         (f"{FINETUNE} --data d --shard-gaussians", "torchrun"),
         *(
             (f"{FINETUNE} --shard-gaussians {other}", f"--shard-gaussians with {other.split()[0]}")
@@ -239,47 +233,31 @@ def test_the_hosts_own_json_flag_is_not_ours():
     assert (result.exit_code, result.stdout) == (2, "")
 
 
-def test_bugs_keep_their_traceback(data, path, monkeypatch):
-
-    def bug(*args, **kwargs):
-        raise ZeroDivisionError("a bug")
-
-    monkeypatch.setattr("fragprune_plugins.workbench.profile.work.measure_all", bug)
-    with pytest.raises(ZeroDivisionError):
-        run("profile", path, "--data", data)
-
-
 @pytest.mark.parametrize(
     ("error", "code"),
     [
         (MemoryError(), "memory"),
         (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you"), "memory"),
         (OSError(36, "File name too long", "/a/b"), "path"),
+        (ZeroDivisionError("a bug"), None),
     ],
 )
-def test_what_the_machine_refuses_is_stated(data, path, monkeypatch, error, code):
-
-    def refuse(*args, **kwargs):
-        raise error
-
-    monkeypatch.setattr("fragprune_plugins.workbench.profile.work.measure_all", refuse)
-    refused(("profile", path, "--data", data), code, "")
-
-
-@pytest.mark.parametrize("command", ["finetune", "export"])
-def test_a_name_that_no_file_can_have_is_no_model(out, command):
-    asked = (command, "x" * 300, "--out", out)
-    fails(*asked, says="cannot be opened (File name too long)", code=1)
-    assert untouched(out)
+def test_what_the_machine_refuses_is_stated_and_bugs_keep_their_traceback(
+    data, path, monkeypatch, error, code
+):
+    measuring = "fragprune_plugins.workbench.profile.work.measure_all"
+    monkeypatch.setattr(measuring, Mock(side_effect=error))
+    if code:
+        refused(("profile", path, "--data", data), code, "")
+        return
+    with pytest.raises(ZeroDivisionError):
+        run("profile", path, "--data", data)
 
 
 def test_a_numpy_that_torch_cannot_use_is_named_before_anything_is_read(tmp_path, monkeypatch):
     """As torch before 2.3 beside NumPy 2."""
-
-    def numpy(tensor):
-        raise RuntimeError("Numpy is not available")
-
-    monkeypatch.setattr(torch.Tensor, "numpy", numpy)
+    unusable = Mock(side_effect=RuntimeError("Numpy is not available"))
+    monkeypatch.setattr(torch.Tensor, "numpy", unusable)
     (tmp_path / "a.ply").write_text("not read")
     for words in (("audit", tmp_path / "a.ply", "--out", tmp_path / "out"), ("doctor",)):
         ended = run(*words)

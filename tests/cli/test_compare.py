@@ -1,6 +1,5 @@
 """fragprune compare and profile."""
 
-import importlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -20,9 +19,14 @@ from fragprune_plugins.workbench.models.formats.ply import write_ply
 FIGURES = ("psnr", "ssim", "fragments_per_pixel", "gaussians")
 
 
-def test_two_models(data, path, model, tmp_path):
-    other = tmp_path / "other.ply"
-    write_ply(other, tiny.cut(model, 0.3))
+@pytest.fixture
+def other(model, tmp_path):
+    """The same Gaussians with thresholds."""
+    write_ply(tmp_path / "other.ply", tiny.cut(model, 0.3))
+    return tmp_path / "other.ply"
+
+
+def test_two_models(data, path, other, tmp_path):
     report = run_json("compare", path, other, "--data", data, "--out", tmp_path / "pictures")
     assert report["speedup"] > 1.2
     assert report["a"]["model"] == str(path)
@@ -61,8 +65,7 @@ def test_frames_are_timed_at_another_size(data, path, tmp_path, monkeypatch):
         sizes.extend((view.width, view.height) for view in views)
         return [{"frame_ms": 1.0, "frame_ms_se": 0.0} for _ in candidates]
 
-    module = importlib.import_module("fragprune_plugins.workbench.figures.evaluate")
-    monkeypatch.setattr(module, "frame_times", frame_times)
+    monkeypatch.setattr(evaluate, "frame_times", frame_times)
     report = run_json("compare", path, path, "--data", data, "--enlarge", 3)
     assert set(sizes) == {(3 * tiny.SIDE, 3 * tiny.SIDE)}
     assert [report["a"][key] for key in FIGURES] == [plain["a"][key] for key in FIGURES]
@@ -82,10 +85,8 @@ def test_views_of_several_sizes_are_not_said_to_have_one(data, path):
     assert "Frames of 64x64 to 128x128 pixels." in text
 
 
-def test_without_photographs_b_is_compared_with_what_a_shows(path, model, tmp_path):
+def test_without_photographs_b_is_compared_with_what_a_shows(path, model, other, tmp_path):
     """Drawn here by hand: PSNR of B's pictures against A's, from the held-out cameras."""
-    other = tmp_path / "other.ply"
-    write_ply(other, tiny.cut(model, 0.3))
     cameras = tiny.write_path(tmp_path / "path.json", [f"v{i}" for i in range(9)], 24, 16)
     report = run_json("compare", path, other, "--cameras", cameras)
     views = [view for name, view in load_cameras(cameras) if name in ("v0", "v8")]
@@ -110,14 +111,6 @@ def test_what_finetune_self_wrote_is_compared_with_what_came_in(path, tmp_path):
     assert (report["target"], report["b"]["views"]) == ("itself", 12)
     for key in FIGURES:
         assert report["b"][key] == pytest.approx(learned["after"][key], rel=1e-5), key
-
-
-def test_profile_measures_against_the_models_own_pictures(path, model):
-    write_ply(path, tiny.cut(model, 0.3))
-    report = run_json("profile", path, "--orbit", "--resolution", 16)
-    assert report["target"] == "itself"
-    assert report["columns"]["untruncated"]["psnr"] is None
-    assert 10 < report["psnr"] < 80
 
 
 def test_a_camera_that_sees_nothing_tells_nothing_of_a_model(path, model, tmp_path):
@@ -169,6 +162,9 @@ def test_profile_has_a_column_with_thresholds_and_one_without(data, path, model,
     text = run("profile", path, "--data", data, "--views", "train").stdout
     assert "7 views" in text
     assert "fragments per pixel" in text
+    report = run_json("profile", path, "--orbit", "--resolution", 16)  # against its own pictures
+    assert (report["target"], report["columns"]["untruncated"]["psnr"]) == ("itself", None)
+    assert 10 < report["psnr"] < 80
 
 
 def test_profile_measures_a_stop_without_cutoffs(data, path, model, tmp_path):

@@ -9,22 +9,10 @@ from cli.commands import fails, run, run_json, succeeds
 from finetune import tiny
 
 import fragprune_plugins as fp
-from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.workbench.figures.wording import VISIBLE
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.models.formats.ply import write_ply
-
-
-def test_one_file_with_the_thresholds(path, model, out):
-    write_ply(path, model)
-    sidecar.save(path, tiny.cut(model, 0.3).thresholds)
-    report = run_json("export", path, "--out", out)
-    assert report["column"] == "trunc_threshold"
-    exported, expected = tiny.state(read_ply(out)), tiny.state(fp.load(path))
-    assert all(torch.equal(exported[name], expected[name]) for name in model.tensors)
-    assert torch.equal(read_ply(out).falloff, fp.load(path).falloff)
-    assert not sidecar.path_beside(out).exists()
 
 
 @pytest.mark.parametrize(
@@ -129,13 +117,6 @@ def test_a_gaussian_without_its_like_gets_no_cutoff(returning, pruned, out, chan
 def test_a_model_without_cutoffs_has_none_to_give(returning, pruned, tmp_path):
     write_ply(tmp_path / "pruned.ply", pruned.untruncated())
     fails(*returning(pruned), says="pruned.ply: a model without cutoffs", code=1)
-
-
-def test_the_model_that_gives_cutoffs_is_not_overwritten(returning, pruned, tmp_path):
-    path = tmp_path / "pruned.ply"
-    before = path.read_bytes()
-    fails(*returning(pruned), "--out", path, says="the model's name")
-    assert path.read_bytes() == before
 
 
 def test_a_file_that_rounds_more_in_a_wide_scene_says_so(path, model, tmp_path):

@@ -55,12 +55,10 @@ def test_says_what_the_model_is_without_its_thresholds(data, words, out):
         assert report["untruncated"][key] == profile["columns"]["untruncated"][key]
         assert report["after"][key] == profile["columns"]["truncated"][key]
     text = run(*words, 10, "--pressure", 1e-3).stdout
-    plain = report["untruncated"]
-    change = plain["psnr"] - report["before"]["psnr"]
-    assert (
-        f"In viewers that know no cutoffs: {plain['psnr']:.2f} dB PSNR "
-        f"({change:+.2f}), {plain['fragments_per_pixel']:.1f} fragments per pixel"
-    ) in text
+    plain, psnr = report["untruncated"], report["untruncated"]["psnr"]
+    quality = f"{psnr:.2f} dB PSNR ({psnr - report['before']['psnr']:+.2f})"
+    drawn = f"{plain['fragments_per_pixel']:.1f} fragments per pixel"
+    assert f"In viewers that know no cutoffs: {quality}, {drawn}" in text
     assert "out.ply, which holds the cutoffs." in text
     assert not sidecar.path_beside(out).exists()
     assert "know no cutoffs" not in run(*words, 10, "--control").stdout
@@ -211,23 +209,19 @@ def test_a_control_is_quoted_only_of_one_training_without_a_stop(tmp_path, contr
     assert not quoted or found["goal"] == "control"
 
 
-def test_a_control_truncates_nothing_and_is_quoted_by_the_same_training(words, out, tmp_path):
-    report = run_json(*words, 6, "--control")
-    assert report["speedup"] == pytest.approx(1, abs=0.05)
-    assert report["untruncated"] is None
-    assert read_ply(out).falloff is None
-    pruned = run_json(*words, 6, "--out", tmp_path / "pruned.ply")
-    assert pruned["control"] == report["after"]
-
-
-def test_a_control_that_ran_after_is_quoted_by_the_finished_command(words, tmp_path):
+def test_a_control_truncates_nothing_and_is_quoted_by_the_same_training(words, tmp_path):
+    """Also if it ran after: by the finished command."""
     assert "no control was found" in run(*words, 6).stdout
     control = run_json(*words, 6, "--control", "--out", tmp_path / "control.ply")
+    assert control["speedup"] == pytest.approx(1, abs=0.05)
+    assert control["untruncated"] is None
+    assert read_ply(tmp_path / "control.ply").falloff is None
     finished = run(*words, 6).stdout
     assert "was finished before" in finished
     assert "no control was found" not in finished
     assert "pruning itself makes" in finished
-    assert run_json(*words, 6)["control"] == control["after"]
+    for more in ((), ("--again",)):
+        assert run_json(*words, 6, *more)["control"] == control["after"]
 
 
 def test_a_target_time_says_what_was_reached(words, monkeypatch):
@@ -254,15 +248,6 @@ def test_a_bound_on_the_loss_trains_the_control_and_names_the_views(words, out):
         assert "chosen on these 2 views" in said
 
 
-def test_figures_of_a_model_do_not_outlive_it(words, out, monkeypatch):
-    """SIGTERM leaves no time to measure what takes its place."""
-    run_json(*words, 5)
-    assert records.beside(out) is not None
-    tiny.at_loss(monkeypatch, 3, lambda: signal.raise_signal(signal.SIGTERM))
-    assert run(*words, 50).exit_code == 143
-    assert records.files(out.parent) == []
-
-
 @pytest.mark.usefixtures("ctrl_c")
 def test_an_interrupted_search_quotes_no_control_that_trained_for_longer(words, monkeypatch):
     tiny.at_loss(monkeypatch, 6 + 4, lambda: signal.raise_signal(signal.SIGINT))
@@ -275,8 +260,10 @@ def test_an_interrupted_search_quotes_no_control_that_trained_for_longer(words, 
 
 
 def test_sigterm_saves_at_once_and_leaves_with_143(words, out, monkeypatch):
+    """It leaves no time to measure, and figures of a model do not outlive it."""
     before = signal.getsignal(signal.SIGTERM)
-
+    run_json(*words, 5)
+    assert records.beside(out) is not None
     tiny.at_loss(monkeypatch, 4, lambda: signal.raise_signal(signal.SIGTERM))
     measuring = "fragprune_plugins.workbench.figures.evaluate.measure_all"
     monkeypatch.setattr(measuring, None)  # whoever sends SIGTERM does not wait for this
@@ -286,6 +273,7 @@ def test_sigterm_saves_at_once_and_leaves_with_143(words, out, monkeypatch):
     # The step under way is finished first.
     assert (report["interrupted"], report["iterations"], report["after"]) == (True, 4, None)
     assert read_ply(out).falloff is not None
+    assert records.files(out.parent) == []
     assert signal.getsignal(signal.SIGTERM) is before
 
 

@@ -10,8 +10,10 @@ from cli.commands import run_json
 from finetune import tiny
 
 import fragprune_plugins as fp
-from fragprune_plugins import RasterInputs, Schedule, Settings
+from fragprune_plugins import RasterInputs
 from fragprune_plugins.learning.pressure import OWN_PRESSURE
+
+VIEWS = [(f"view{i}", camera.view()) for i, camera in enumerate(tiny.cameras(3))]
 
 
 @pytest.fixture
@@ -63,17 +65,11 @@ def test_it_has_a_pressure_of_its_own(path, cameras, out):
     assert finetuned(*words, "--pressure", 3e-3)["pressure"] == 3e-3
 
 
-def test_thresholds_learn_from_its_first_step():
-    assert Schedule(Settings(iterations=9000, itself=True)).at(1).learn
-    assert not Schedule(Settings(iterations=9000)).at(1).learn
-
-
 @pytest.mark.parametrize("falloff", [None, 0.4])
 def test_the_target_is_what_the_model_shows_as_it_came_in(model, falloff):
     """Truncated if it was: without its thresholds a pruned model is another picture."""
     store = falloff and fp.ThresholdStore.from_falloff(torch.full((len(model),), falloff))
-    views = [(f"view{i}", camera.view()) for i, camera in enumerate(tiny.cameras(3))]
-    shot = fp.own_pictures(replace(model, thresholds=store), views, views).train[0]
+    shot = fp.own_pictures(replace(model, thresholds=store), VIEWS, VIEWS).train[0]
     thresholds = store and store.values.detach().clone()
     if store:
         store.place(store.logits.detach() + 1)  # it learns
@@ -93,10 +89,6 @@ def test_in_python_needs_no_cameras(model):
     image = dataset.test[0].image
     assert image.shape == (3, 800, 800)
     assert float(image.max()) > 0.1
-
-
-def test_settings_follow_from_whose_pictures_they_are(model):
-    """A stop and a pressure for photographs would change what they must not."""
-    views = [(f"view{i}", camera.view()) for i, camera in enumerate(tiny.cameras(3))]
-    result = fp.finetune(model, fp.own_pictures(model, views), fp.Settings(2))
+    result = fp.finetune(model, fp.own_pictures(model, VIEWS), fp.Settings(2))
+    # A stop and a pressure for photographs would change what they must not.
     assert (result.settings.itself, result.model.stop) == (True, None)

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -66,22 +67,18 @@ def test_a_kill_of_one_ends_all_with_one_error_and_keeps_saves(tuning, tmp_path,
     assert names(tmp_path) - files == (locks if killed == 0 else set())
 
 
-def test_a_process_that_raises_takes_all_down_with_its_own_words(tuning, tmp_path):
-    def unreadable():
-        def image(shot):
-            raise DatasetError(shot.name, "a torn page", "a photograph", "Scan it again.")
+def test_a_process_that_raises_takes_all_down_with_its_own_words(tuning, out, tmp_path):
+    torn = DatasetError("view", "a torn page", "a photograph", "Scan it again.")
 
-        Photograph.image = property(image)
+    def unreadable(rank):
+        if rank == 1:
+            at_step(5, lambda: setattr(Photograph, "image", property(Mock(side_effect=torn))))
 
     files = names(tmp_path)
-    ended = command(
-        2,
-        *tuning(tmp_path / "out.ply", "--json"),
-        prepare=lambda rank: at_step(5, unreadable) if rank == 1 else None,
-    )
-    (first, silent, _), (second, out, _) = (each.left for each in ended)
+    ended = command(2, *tuning(out, "--json"), prepare=unreadable)
+    (first, silent, _), (second, said, _) = (each.left for each in ended)
     assert (first, second) == (1, 1)
-    assert json.loads(silent + out)["error"]["found"] == "a torn page"
+    assert json.loads(silent + said)["error"]["found"] == "a torn page"
     assert names(tmp_path) == files
 
 
@@ -97,12 +94,12 @@ def test_a_signal_to_one_ends_all_after_the_same_step(tuning, tmp_path, number, 
             return run_json(*tuning(place, "--views-per-step", 2))
         return json.loads(command(2, *tuning(place, *more, "--json"))[0].left[1])
 
+    def prepare(rank):
+        if rank == 1:
+            at_step(6, lambda: signal.raise_signal(number))
+
     again(whole)
-    ended = command(
-        2,
-        *tuning(out, *more),
-        prepare=lambda rank: at_step(6, lambda: signal.raise_signal(number)) if rank == 1 else None,
-    )
+    ended = command(2, *tuning(out, *more), prepare=prepare)
     (first, text, _), second = (each.left for each in ended)
     assert (first, second) == (128 + number, (0, "", ""))
     assert "7 of 20 iterations" in text
@@ -127,10 +124,9 @@ def test_what_is_refused_is_said_once(tuning, tmp_path, more, found):
 
 @pytest.mark.parametrize("more", [("--max-drop", 0.5, "--keep", 0.9), ("--self",)])
 def test_what_goes_before_and_around_learning_is_the_same_in_both(tuning, tmp_path, more):
-    one, two = tmp_path / "one.ply", tmp_path / "two.ply"
-    more = (*more, "--iters", 3)
-    run_json(*tuning(one, *more, "--views-per-step", 2))
-    first, second = command(2, *tuning(two, *more, "--json"))
+    one, two = (tmp_path / name for name in ("one.ply", "two.ply"))
+    run_json(*tuning(one, *more, "--iters", 3, "--views-per-step", 2))
+    first, second = command(2, *tuning(two, *more, "--iters", 3, "--json"))
     assert (first.left[0], second.left) == (0, (0, "", ""))
     assert one.read_bytes() == two.read_bytes()
 
@@ -163,17 +159,16 @@ from fragprune_plugins.workbench.finetune import resuming
 resuming.EVERY = 0.001
 main()
 """
+LAUNCHER = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2"]
 
 
 @pytest.mark.slow
 def test_torchrun_itself_ends_when_one_is_killed_and_goes_on(tuning, tmp_path):
     """The same, with the real launcher, whose exit code is 1 then."""
     out, whole = tmp_path / "out.ply", tmp_path / "whole.ply"
-    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
     script = tmp_path / "often.py"
     script.write_text(OFTEN)
-    launcher += ["--nproc_per_node", "2", str(script)]
-    line = [*launcher, *map(str, tuning(out, "--iters", 300))]
+    line = [*LAUNCHER, str(script), *map(str, tuning(out, "--iters", 300))]
     with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as run_:
         children = Path(f"/proc/{run_.pid}/task/{run_.pid}/children")
         while not out.with_suffix(".fragprune-unfinished").exists():
@@ -193,10 +188,8 @@ def test_torchrun_itself_ends_when_one_is_killed_and_goes_on(tuning, tmp_path):
     assert done.stdout.count("PSNR, dB") == 1
     run_json(*tuning(whole, "--iters", 300, "--views-per-step", 2))
     assert out.read_bytes() == whole.read_bytes()
-    assert {name for name in names(tmp_path) if "out" in name or name[0] == "."} == {
-        "out.ply",
-        "out.fragprune.json",
-    }
+    left = {name for name in names(tmp_path) if "out" in name or name[0] == "."}
+    assert left == {"out.ply", "out.fragprune.json"}
 
 
 @pytest.mark.gpu
@@ -207,9 +200,8 @@ def test_two_gpus_learn_what_one_does_with_two_views_a_step(tuning, tmp_path, mo
         pytest.skip("needs two GPUs")
     one, two = tmp_path / "one.ply", tmp_path / "two.ply"
     whole = run_json(*tuning(one, "--views-per-step", 2, "--device", "cuda:0"))
-    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
-    launcher += ["--nproc_per_node", "2", "-m", "fragprune_plugins"]
-    line = [*launcher, *map(str, tuning(two, "--device", "cuda", "--json", *more))]
+    words = tuning(two, "--device", "cuda", "--json", *more)
+    line = [*LAUNCHER, "-m", "fragprune_plugins", *map(str, words)]
     done = subprocess.run(line, capture_output=True, text=True, timeout=200)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)

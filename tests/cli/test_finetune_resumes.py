@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+from unittest.mock import Mock
 
 import pytest
 from cli.commands import fails, run, run_json, succeeds
@@ -56,8 +57,7 @@ def test_ctrl_c_is_gone_on_from_with_the_same_gaussians(tuning, tmp_path, monkey
     assert not resuming.path_beside(out).exists()
 
 
-def test_a_finished_command_says_so_and_does_nothing(tuning, tmp_path, monkeypatch):
-    out = tmp_path / "out.ply"
+def test_a_finished_command_says_so_and_does_nothing(tuning, out, monkeypatch):
     first = run_json(*tuning(out, "--iters", 2))
     with monkeypatch.context() as patch:
         patch.setattr("fragprune_plugins.workbench.finetune.api.finetune", None)  # cannot be called
@@ -69,19 +69,15 @@ def test_a_finished_command_says_so_and_does_nothing(tuning, tmp_path, monkeypat
     assert run_json(*tuning(out, "--iters", 2, "--again"))["already_finished"] is False
 
 
-def test_a_record_without_space_takes_no_figures_and_no_checkpoint(tuning, tmp_path, monkeypatch):
-    out, replacing = tmp_path / "out.ply", records.replacing
+def test_a_record_without_space_takes_no_figures_and_no_checkpoint(tuning, out, monkeypatch):
     monkeypatch.setattr(resuming, "EVERY", 0.0)
-
-    def full(path, **options):
-        raise OutputError(str(path), "no space", "a place", "Free some.")
-
-    monkeypatch.setattr(records, "replacing", full)
-    result = run(*tuning(out, "--iters", 3), "--json")
+    with monkeypatch.context() as patch:
+        full = OutputError(str(out), "no space", "a place", "Free some.")
+        patch.setattr(records, "replacing", Mock(side_effect=full))
+        result = run(*tuning(out, "--iters", 3), "--json")
     assert result.exit_code == 1
     assert json.loads(result.stdout)["after"]["psnr"] > 0
     assert f"{out} is written, its record is not: [output]" in result.stderr
-    monkeypatch.setattr(records, "replacing", replacing)
     assert run_json(*tuning(out, "--iters", 3))["resumed_at"] == 3
     assert records.beside(out)
 
@@ -89,8 +85,8 @@ def test_a_record_without_space_takes_no_figures_and_no_checkpoint(tuning, tmp_p
 @pytest.mark.parametrize(
     "change", ["other options", "another model", "another photograph", "rewritten", "no record"]
 )
-def test_what_is_not_the_same_is_not_finished(tuning, data, path, tmp_path, change):
-    out, more = tmp_path / "out.ply", []
+def test_what_is_not_the_same_is_not_finished(tuning, data, path, out, change):
+    more = []
     run_json(*tuning(out, "--iters", 2))
     if change == "other options":
         more = ["--pressure", 1e-3]
@@ -108,18 +104,14 @@ def test_what_is_not_the_same_is_not_finished(tuning, data, path, tmp_path, chan
     assert run_json(*tuning(out, "--iters", 2, *more))["already_finished"] is False
 
 
-def test_another_command_is_refused_while_one_is_unfinished(tuning, tmp_path):
-    out = tmp_path / "out.ply"
+def test_another_command_is_refused_while_one_is_unfinished(tuning, out):
     killed(9, *tuning(out))
     other = tuning(out, "--pressure", 1e-3)
     fails(*other, says=("[checkpoint]", "with other goal"), code=1)
     assert run_json(*other, "--again")["resumed_at"] == 0
 
 
-def test_two_at_once_are_refused(tuning, tmp_path):
-    out = tmp_path / "out.ply"
+def test_two_at_once_are_refused(tuning, out):
     with locked(out, wait=0, what="run"):
-        refused = run(*tuning(out))
-    assert refused.exit_code == 1
-    assert "another process" in refused.stderr
+        fails(*tuning(out), says="another process", code=1)
     succeeds(*tuning(out))

@@ -30,6 +30,19 @@ def output(data, model, tmp_path):
     return tiny.host_output(tmp_path / "out", data, model)
 
 
+@pytest.fixture
+def lens(data):
+    """Writes the cameras of the scene with another principal point."""
+    file = data / "sparse" / "0" / "cameras.txt"
+    return lambda centre: file.write_text(f"7 PINHOLE {tiny.SIDE} {tiny.SIDE} 36 36 {centre}\n")
+
+
+@pytest.fixture
+def short(tmp_path):
+    """What a short fine-tuning of opacities is told."""
+    return "--out", tmp_path / "r.ply", "--iters", 2, "--train", "opacity"
+
+
 def test_commands_take_the_newest_model_and_the_trainings_cameras(output, tmp_path):
     result = succeeds("profile", output)
     assert "iteration_10000" in result.stderr
@@ -70,39 +83,37 @@ def test_a_folder_with_one_output_folder_is_that(output, tmp_path):
         newest_model(tmp_path)
 
 
-def test_options_override_the_training(output):
+def test_options_override_the_training(output, path):
     assert run_json("profile", output, "--resolution", 2)["views"] == 2
     fails("profile", output, "--images", "images_2", says="images_2", code=1)
+    fails("profile", path, says="no cfg_args")  # a model elsewhere needs --data
 
 
-def test_pictures_are_drawn_as_the_training_did_around_the_middle(output, data, tmp_path):
+def test_pictures_are_drawn_as_the_training_did_around_the_middle(output, data, lens, tmp_path):
     """3DGS ignores the principal point, and so do its descendants."""
-    lens = f"7 PINHOLE {tiny.SIDE} {tiny.SIDE} 36 36"
     psnr = {}
-    for name, centre in (("own", "20 16"), ("middle", "16 16")):
-        (data / "sparse" / "0" / "cameras.txt").write_text(f"{lens} {centre}\n")
-        psnr[name] = run_json("profile", output)["psnr"]
+    for centre in ("20 16", "16 16"):
+        lens(centre)
+        psnr[centre] = run_json("profile", output)["psnr"]
         for more in (("--data", data), ("--out", tmp_path / "pictures")):
-            assert run_json("profile", output, *more)["psnr"] == psnr[name]
-        assert run_json("compare", output, output, "--data", data)["a"]["psnr"] == psnr[name]
-    assert psnr["own"] == psnr["middle"]
+            assert run_json("profile", output, *more)["psnr"] == psnr[centre]
+        assert run_json("compare", output, output, "--data", data)["a"]["psnr"] == psnr[centre]
+    assert psnr["20 16"] == psnr["16 16"]
     for more in ((), ("--self",)):
         words = ("--out", pruned := tmp_path / f"pruned{len(more)}.ply", "--iters", 2)
         run_json("finetune", output, *words, *more)
-        psnr = {}
-        for centre in ("16 16", "20 16"):
-            (data / "sparse" / "0" / "cameras.txt").write_text(f"{lens} {centre}\n")
+        for centre in psnr:
+            lens(centre)
             psnr[centre] = run_json("profile", pruned, "--data", data)["psnr"]
-        assert psnr["16 16"] == psnr["20 16"]
+        assert psnr["20 16"] == psnr["16 16"]
 
 
 @pytest.mark.parametrize("middle", [True, False])
 def test_a_model_is_fine_tuned_around_the_point_by_which_it_shows_its_photographs(
-    data, model, path, tmp_path, caplog, middle
+    data, model, path, lens, short, tmp_path, caplog, middle
 ):
     """Where it lies says what hosts usually do; the photographs know better."""
-    lens = f"7 PINHOLE {tiny.SIDE} {tiny.SIDE} 36 36 20 16\n"
-    (data / "sparse" / "0" / "cameras.txt").write_text(lens)
+    lens("20 16")
     words = ("finetune", path, "--data", data)
     if not middle:
         scene = load_dataset(data, centred=False)
@@ -111,42 +122,36 @@ def test_a_model_is_fine_tuned_around_the_point_by_which_it_shows_its_photograph
             tiny.save_png(shot.path, drawn.image.detach())
         words = ("finetune", tiny.host_output(tmp_path / "out", data, model))
         caplog.clear()
-    said = run(*words, "--out", tmp_path / "r.ply", "--iters", 2).stderr
-    assert "principal point is up to" not in caplog.text
+    said = run(*words, *short).stderr
     where = "the middle" if middle else "the scene's principal point"
     assert f"MODEL is drawn around {where}" in said
     assert "principal point" not in caplog.text  # it was asked for, so nothing is wrong
 
 
-@pytest.mark.parametrize("dropped", [True, False])
-def test_alpha_counts_as_the_model_shows_it_where_nothing_tells(data, path, tmp_path, dropped):
-    """3DGS drops that of a COLMAP scene's images; some of its forks do not."""
+@pytest.mark.parametrize("dropped", [True, False, None])
+def test_alpha_counts_as_the_model_shows_it_where_nothing_tells(
+    data, path, short, tmp_path, dropped
+):
+    """3DGS drops that of a COLMAP scene's images; some of its forks do not. None hides nothing."""
     for image in sorted((data / "images").iterdir()):
         with Image.open(image) as picture:
             faint = picture.convert("RGBA")
         alpha = Image.linear_gradient("L").resize(faint.size).point(lambda x: max(x, 128))
-        if not dropped:  # composited over black, the picture is what the model shows
+        if dropped is False:  # composited over black, the picture is what the model shows
             shown = np.asarray(faint, np.float32)[..., :3]
             whole = shown / (np.asarray(alpha, np.float32)[..., None] / 255)
             faint = Image.fromarray(whole.clip(0, 255).astype(np.uint8)).convert("RGBA")
-        faint.putalpha(alpha)
+        if dropped is not None:
+            faint.putalpha(alpha)
         faint.save(image)
     psnr = run_json("profile", path, "--data", data)["psnr"]
     assert psnr > 25  # of faint colours at 8 bits
     assert run_json("compare", path, path, "--data", data)["a"]["psnr"] == psnr
-    pruned = tmp_path / "r.ply"
-    result = run("finetune", path, "--data", data, "--out", pruned, "--iters", 2)
-    assert ("ignores the images' alpha" in result.stderr) == dropped
-    assert "another scene" not in result.stderr
-    assert run_json("profile", pruned, "--data", data)["psnr"] == pytest.approx(psnr, abs=1)
-
-
-def test_alpha_that_hides_nothing_is_no_news(data, path, tmp_path):
-    for image in (data / "images").iterdir():
-        with Image.open(image) as picture:
-            picture.convert("RGBA").save(image)
-    result = run("finetune", path, "--data", data, "--out", tmp_path / "r.ply", "--iters", 2)
-    assert "alpha" not in result.stderr
+    said = run("finetune", path, "--data", data, *short).stderr
+    assert ("ignores the images' alpha" in said) == ("alpha" in said) == (dropped is True)
+    assert "another scene" not in said
+    pruned = run_json("profile", tmp_path / "r.ply", "--data", data)
+    assert pruned["psnr"] == pytest.approx(psnr, abs=1)
 
 
 def test_an_orbit_is_one_also_where_the_trainings_cameras_are_known(output, monkeypatch):
@@ -187,15 +192,10 @@ def test_pictures_have_the_background_of_the_training(data, model, tmp_path, whi
         assert background == [float(white)] * 3
 
 
-def test_a_model_elsewhere_needs_data(path):
-    fails("profile", path, says="no cfg_args")
-
-
 @pytest.mark.parametrize("beside", [False, True])
 def test_a_training_that_held_nothing_out_is_warned_of(data, model, tmp_path, caplog, beside):
     output = tiny.host_output(tmp_path / "out", data, model, eval=False)
-    more = ("--data", data, "--white-background") if beside else ()
-    succeeds("profile", output, *more)
+    succeeds("profile", output, *(("--data", data, "--white-background") if beside else ()))
     assert "trained without --eval" in caplog.text
 
 
@@ -237,38 +237,34 @@ def listed(output):
         ((0,), 4, True),  # a part of the photographs
     ],
 )
-def test_a_training_that_held_others_out_has_seen_ours(listed, tmp_path, caplog, held, of, seen):
-    words = ("--out", tmp_path / "r.ply", "--iters", 2, "--train", "opacity")
-    assert run_json("finetune", listed(held, of=of), *words)["seen"] is seen
-    assert ("held out other views, of" in caplog.text) is seen
+def test_a_training_that_held_others_out_has_seen_ours(
+    listed, short, monkeypatch, caplog, held, of, seen
+):
+    learned, told = work._learned, []
 
+    def learning(*given):
+        told.append("held out other views, of" in caplog.text)  # before it
+        return learned(*given)
 
-def test_it_is_warned_of_before_the_learning(listed, tmp_path, monkeypatch, caplog):
-    def learned(*_):
-        assert "held out other views, of" in caplog.text
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(work, "_learned", learned)
-    words = ("--out", tmp_path / "r.ply", "--iters", 2, "--train", "opacity")
-    assert run("finetune", listed((3, 4)), *words).exit_code == 130
+    monkeypatch.setattr(work, "_learned", learning)
+    assert run_json("finetune", listed(held, of=of), *short)["seen"] is seen
+    assert told == [seen]
 
 
 @pytest.mark.parametrize(("at", "said"), [(0.0, False), (1e-5, False), (0.5, True)])
-def test_a_training_whose_cameras_were_elsewhere_is_warned_of(listed, tmp_path, at, said):
-    words = ("--out", tmp_path / "r.ply", "--iters", 2, "--train", "opacity")
-    result = run("finetune", listed((0, 8), at), *words)
+def test_a_training_whose_cameras_were_elsewhere_is_warned_of(listed, short, at, said):
+    result = run("finetune", listed((0, 8), at), *short)
     assert ("the camera of view01.png was elsewhere" in result.stderr) is said
 
 
 @pytest.mark.parametrize(("gain", "refused"), [(1.0, False), (1.2, True)])
-def test_a_model_learns_no_photograph_it_shows_under_an_exposure(output, tmp_path, gain, refused):
+def test_a_model_learns_no_photograph_it_shows_under_an_exposure(output, short, gain, refused):
     rows = (gain * torch.eye(3, 4)).tolist()
     (output / "exposure.json").write_text(json.dumps({"view00": rows}))
-    words = ("finetune", output, "--out", tmp_path / "r.ply", "--iters", 2)
     if refused:
-        fails(*words, says=("an exposure for view00", "--self"))
+        fails("finetune", output, *short, says=("an exposure for view00", "--self"))
     else:
-        succeeds(*words)
+        succeeds("finetune", output, *short)
 
 
 def test_figures_of_a_model_with_exposures_say_that_they_are_left_out(output):
@@ -327,30 +323,24 @@ def test_a_record_that_says_nothing_of_its_result_is_believed_by_its_time_alone(
 def test_photographs_that_are_learned_from_too_are_not_said_to_be_held_out(model, tmp_path):
     data = tiny.write_blender(tmp_path / "scene", tiny.photographs(model))
     (data / "transforms_test.json").write_text((data / "transforms_train.json").read_text())
-    path = tmp_path / "a model.ply"
-    write_ply(path, model)
+    write_ply(path := tmp_path / "a model.ply", model)
     words = ("--data", data, "--out", tmp_path / "a b.ply", "--iters", 3, "--train", "opacity")
     said = run("finetune", path, *words).stdout
     assert "on 7 views that its training had seen." in said
     assert f"fragprune view '{tmp_path / 'a b.ply'}'. A page" in said  # as words of a command
 
 
-SIZES = {
-    -1: Resolution(width=1600, shrink_only=True),
-    1: Resolution(divide=1),
-    4: Resolution(divide=4),
-    500: Resolution(width=500),
-}
-
-
-@pytest.mark.parametrize("asked", SIZES)
-def test_the_size_of_photographs_is_the_hosts(data, model, tmp_path, asked):
-    output = tiny.host_output(
-        tmp_path / "out", data, model, resolution=asked, white_background=True, images="images_8"
-    )
-    model_file = output / "point_cloud" / "iteration_900" / "point_cloud.ply"
-    how = {"centred": True, "opaque": not (data / "transforms_train.json").exists()}
-    assert trained_on(model_file) == Photographs(data, SIZES[asked], True, "images_8", **how)
+@pytest.mark.parametrize(
+    ("asked", "size"),
+    [
+        (-1, Resolution(width=1600, shrink_only=True)),
+        *((1, Resolution(divide=1)), (4, Resolution(divide=4)), (500, Resolution(width=500))),
+    ],
+)
+def test_the_size_of_photographs_is_the_hosts(data, model, tmp_path, asked, size):
+    known = {"resolution": asked, "white_background": True, "images": "images_8"}
+    read = trained_on(newest_model(tiny.host_output(tmp_path / "out", data, model, **known)))
+    assert read == Photographs(data, size, True, "images_8", centred=True, opaque=True)
 
 
 @pytest.mark.parametrize(("known", "opaque"), [({}, False), ({"train_test_exp": False}, True)])
@@ -358,27 +348,20 @@ def test_3dgs_since_october_2024_drops_the_alpha_of_blenders_images(model, tmp_p
     (tmp_path / "scene").mkdir()
     (tmp_path / "scene" / "transforms_train.json").touch()
     output = tiny.host_output(tmp_path / "out", tmp_path / "scene", model, **known)
-    read = trained_on(output / "point_cloud" / "iteration_900" / "point_cloud.ply")
-    assert read.opaque == opaque
+    assert trained_on(newest_model(output)).opaque == opaque
 
 
 @pytest.mark.parametrize(
     "text",
     [
-        "",
-        "Namespace(",
-        "Namespace(images='a')",
-        "Namespace(source_path=print(1))",
-        "Namespace(source_path='a', resolution='x')",
-        "[1]",
-        "(" * 5000,
+        *("", "Namespace(", "Namespace(images='a')", "Namespace(source_path=print(1))"),
+        *("Namespace(source_path='a', resolution='x')", "[1]", "(" * 5000, "\x00"),
         "Namespace(source_path='a', images=" + '{"a":' * 500,
-        "\x00",
     ],
 )
 def test_arguments_that_are_none_are_refused_and_not_executed(output, text, capsys):
     (output / "cfg_args").write_text(text)
     with pytest.raises(DatasetError, match="cfg_args: not the arguments of a training") as stated:
-        trained_on(output / "point_cloud" / "iteration_900" / "point_cloud.ply")
+        trained_on(newest_model(output))
     assert capsys.readouterr().out == ""
     assert "memory" not in stated.value.found

@@ -109,13 +109,20 @@ def test_as_text_the_result_comes_first(out):
 
 @pytest.mark.parametrize(
     ("name", "found", "remedy"),
-    [("pruned.ply", "a file", "fragprune view "), ("nowhere", "no such folder", "Check the name")],
+    [
+        ("pruned.ply", "a file", "fragprune view "),
+        ("nowhere", "no such folder", "Check the name"),
+        ("empty", "no file *.fragprune.json in it or below", "Run one of these first."),
+    ],
 )
-def test_what_is_no_folder_is_refused_with_the_next_command(out, name, found, remedy):
+def test_where_no_record_is_the_next_command_is_named(out, name, found, remedy):
+    (out / "empty").mkdir()
     error = run_error("report", out / name, "--json")
     assert (error["where"], error["found"]) == (str(out / name), found)
     assert remedy in error["remedy"]
+    assert "run or finetune" in error["expected"]
     assert (f"fragprune report {out};" in error["remedy"]) == (name == "pruned.ply")
+    assert not list((out / "empty").iterdir())
 
 
 def test_comparisons_come_along_with_their_pictures(out, data):
@@ -267,13 +274,6 @@ def test_a_folder_of_controls_alone_is_named_as_one(out, data, tmp_path):
     assert report["control"] is True
     assert report["pictures"] == 7 * len(report["views"]) + 1  # what it learned, too
     assert run_json("report", out)["control"] is False
-
-
-def test_a_folder_without_records_says_what_to_run(tmp_path):
-    result = run("report", tmp_path)
-    assert result.exit_code == 1
-    assert "run or finetune" in result.stderr
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_figures_that_are_not_numbers_are_null(tmp_path):

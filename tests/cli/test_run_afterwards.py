@@ -49,6 +49,11 @@ import os"""
 WORDS = ["--device", "cpu", "--iters", 6]
 
 
+def hear_ctrl_c():
+    """As at a terminal: a job in the background is started with it ignored."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 @pytest.fixture(scope="module")
 def trained(photographs, tmp_path_factory):
     """The PLY of a training of the demo's host."""
@@ -203,41 +208,29 @@ def test_an_interrupted_second_stage_is_told_how_to_go_on(host, photographs, mon
     assert run_json("run", *more, *WORDS, *words)["resumed_at"] == 3
 
 
-def hear_ctrl_c():
-    """As at a terminal: a job in the background is started with it ignored."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-def test_a_fork_whose_ply_is_not_plain_is_not_trained(fork, photographs, tmp_path):
-    root = fork(("return self._xyz", "return self._xyz + self.moved")).root
-    command = ["--", root / "train.py", "-s", photographs, "-m", tmp_path / "out"]
-    fails("run", *WORDS, *command, says="no adapter fits", code=1)
-
-
-OTHER_MODEL = "\nfrom scene.flat import FlatGaussianModel\n"
 NO_ADAPTER = "no adapter fits"
 
 
 @pytest.mark.parametrize(
-    ("more", "scene", "script", "processes", "says"),
+    ("more", "changed", "says"),
     [
-        *((("--stage", stage), "", "", "1", NO_ADAPTER) for stage in ("joint", "off")),
-        (("--adapter", "3dgs-fork"), "", "", "1", NO_ADAPTER),
-        ((), "", OTHER_MODEL, "1", NO_ADAPTER),
-        ((), "nothing", "", "1", "[dataset]"),
-        ((), "", "", "2", "several processes"),
+        *((("--stage", stage), {}, NO_ADAPTER) for stage in ("joint", "off")),
+        (("--adapter", "3dgs-fork"), {}, NO_ADAPTER),
+        ((), {"script": "\nfrom scene.flat import FlatGaussianModel\n"}, NO_ADAPTER),
+        ((), {"model": "return self._xyz + self.moved"}, NO_ADAPTER),  # its PLY is not plain
+        ((), {"scene": "nothing"}, "[dataset]"),
+        ((), {"processes": "2"}, "several processes"),
     ],
-    ids=["joint", "off", "an adapter", "another model", "photographs", "processes"],
 )
 def test_what_cannot_be_done_is_refused_before_the_training(
-    host, photographs, tmp_path, monkeypatch, more, scene, script, processes, says
+    host, photographs, tmp_path, monkeypatch, more, changed, says
 ):
-    monkeypatch.setenv("WORLD_SIZE", processes)
-    words = host(photographs / scene)
-    with words[2].open("a") as file:
-        file.write(script)
-    code = 2 if processes == "2" else 1
-    fails("run", *WORDS, *more, *words, says=says, code=code)
+    monkeypatch.setenv("WORLD_SIZE", changed.get("processes", "1"))
+    words = host(photographs / changed.get("scene", ""))
+    edit(words[2], "\nprint(", changed.get("script", "") + "\nprint(")
+    model = words[2].parent / "scene/gaussian_model.py"
+    edit(model, "return self._xyz", changed.get("model", "return self._xyz"))
+    fails("run", *WORDS, *more, *words, says=says, code=2 if "processes" in changed else 1)
     assert not (tmp_path / "out").exists()
 
 

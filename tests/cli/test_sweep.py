@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from cli.commands import fails, run
@@ -129,21 +130,24 @@ def test_options_of_the_interpreter_are_lost_only_where_it_is_ours(tmp_path, cap
     assert not caplog.text
 
 
-def test_a_script_that_starts_no_training_fails(tmp_path):
-    script = script_of(tmp_path, "python -c 'print(1)'")
-    fails("run", "--", script, says="started no script of a host by the word python", code=1)
+@pytest.mark.parametrize(
+    ("text", "more", "says", "code"),
+    [
+        ("python -c 'print(1)'", (), "started no script of a host by the word python", 1),
+        ("python train.py", ("--log", "csv:{}/steps.csv"), "one training", 2),
+    ],
+)
+def test_what_is_no_sweep_of_trainings_is_refused(tmp_path, text, more, says, code):
+    more = [word.format(tmp_path) for word in more]
+    fails("run", *more, "--", script_of(tmp_path, text), says=says, code=code)
 
 
 @pytest.mark.parametrize(
     "line",
     [
-        "source activate gs",
-        "  conda activate gs && python train.py",
-        "uv run train.py",
-        "/opt/gs/bin/python train.py",
-        "torchrun --nproc-per-node 2 train.py",
-        "python -m torch.distributed.run train.py",
-        "env -i python train.py",
+        *("source activate gs", "  conda activate gs && python train.py", "uv run train.py"),
+        *("/opt/gs/bin/python train.py", "torchrun --nproc-per-node 2 train.py"),
+        *("python -m torch.distributed.run train.py", "env -i python train.py"),
         'export PATH="$ENV/bin:$PATH"',
     ],
 )
@@ -195,39 +199,24 @@ def test_words_behind_the_script_are_its_own(between, tmp_path, monkeypatch):
     assert asked == [(["all.sh", "--", "room"], ["--quick"])]
 
 
-def test_a_log_is_of_a_single_training(tmp_path):
-    script = script_of(tmp_path, "python train.py")
-    fails("run", "--log", f"csv:{tmp_path}/steps.csv", "--", script, says="one training")
-
-
 @pytest.mark.parametrize(
     ("words", "served"),
     [
-        ([HOST / "train.py"], True),
+        *(([HOST / "train.py"], True), (["-u", HOST / "train.py"], True)),
         ([HOST / "render.py", "-m", "out"], True),
-        (["-u", HOST / "train.py"], True),
-        (["-c", "print(1)"], False),
-        (["-m", "tqdm"], False),
-        (["nothere.py"], False),
-        ([], False),
+        *((words, False) for words in (["-c", "print(1)"], ["-m", "tqdm"], ["nothere.py"], [])),
     ],
 )
 def test_scripts_of_hosts_are_served(words, served, tmp_path, monkeypatch):
-    taken = []
-
-    class TakenError(Exception):
-        pass
-
-    def execv(path, words):
-        taken.append(words)
-        raise TakenError
-
+    execv = Mock(side_effect=KeyboardInterrupt)
     monkeypatch.setattr(started.os, "execv", execv)
     (tmp_path / OPTIONS).write_text("[]")
     (tmp_path / STOPPED).touch()  # what is served does not start any more
-    with pytest.raises(SystemExit if served else TakenError):
-        started.main(tmp_path, list(map(str, words)))
-    assert taken == ([] if served else [[sys.executable, *map(str, words)]])
+    words = [*map(str, words)]
+    with pytest.raises(SystemExit if served else KeyboardInterrupt):
+        started.main(tmp_path, words)
+    if not served:
+        execv.assert_called_once_with(sys.executable, [sys.executable, *words])
 
 
 def test_a_training_that_fails_leaves_its_exit_code(tmp_path):
