@@ -23,7 +23,6 @@ from fragprune_plugins.workbench.commands.command import Command, Report, work_o
     "--views",
     type=click.IntRange(1, 1000),
     default=12,
-    show_default=True,
     help="Cameras to generate, or to take evenly from the given ones, at most.",
 )
 @click.option("--out", type=shared.FILE, help="Folder for audit.html, audit.json and maps.")

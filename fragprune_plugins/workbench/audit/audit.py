@@ -27,31 +27,17 @@ from fragprune_plugins.engines.fragments import fragments
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.schedule import USUAL_STOP
 from fragprune_plugins.types import View, one_line
-from fragprune_plugins.workbench.figures import extents
-from fragprune_plugins.workbench.figures.evaluate import Candidate, frame_times
-from fragprune_plugins.workbench.figures.metrics import psnr
-from fragprune_plugins.workbench.figures.wording import sizes
+from fragprune_plugins.workbench.figures import evaluate, extents, metrics, wording
+from fragprune_plugins.workbench.figures.extents import VIEWERS
 from fragprune_plugins.workbench.scenes.generated import Named
 
-HALF_LEVEL = 0.5 / 255
-"""What an 8-bit picture does not show."""
-
-TILES = 384
-"""Tiles of 16x16 pixels, of all views together, whose fragments are weighed."""
-
-SHOWN = 3
-"""Views that pictures show and frames are timed on."""
-
+HALF_LEVEL = 0.5 / 255  # what an 8-bit picture does not show
+TILES = 384  # tiles of 16x16 pixels, of all views together, whose fragments are weighed
+SHOWN = 3  # views that pictures show and frames are timed on
 REPEATS = 5
-
-DARK = 0.05
-"""A fragment is behind what is opaque if less light than this is left for it."""
-
-RIM = math.exp(-2.0)
-"""A fragment is at the rim where the falloff is below this: beyond 2 sigma."""
-
-FAINT = 0.1
-"""Opacity of a Gaussian that hides little."""
+DARK = 0.05  # a fragment is behind what is opaque if less light than this is left for it
+RIM = math.exp(-2.0)  # a fragment is at the rim where the falloff is below this: beyond 2 sigma
+FAINT = 0.1  # opacity of a Gaussian that hides little
 
 REASONS = ("behind what is opaque", "at the rim, beyond 2 sigma", "of faint Gaussians", "others")
 """Where an idle fragment sits: the first that is true of it."""
@@ -59,7 +45,6 @@ REASONS = ("behind what is opaque", "at the rim, beyond 2 sigma", "of faint Gaus
 AS_IT_IS = "as it is"
 UNTRUNCATED = "without its cutoffs and stop"
 HONOURING = "a viewer that knows its cutoffs"
-
 _COUNTS = ("fragments_per_pixel", "evaluated_per_pixel")
 
 
@@ -148,8 +133,8 @@ class Shown:
 
     name: str
     image: Tensor  # (3, H, W)
-    fragments: Tensor  # (H, W) drawn per pixel
-    overdraw: Tensor  # (H, W) ellipses of sqrt(8) standard deviations over each pixel
+    fragments: Tensor  # (H, W) drawn
+    overdraw: Tensor  # (H, W) ellipses of sqrt(8) standard deviations
 
 
 @torch.no_grad()
@@ -164,15 +149,13 @@ def audit(
 ) -> tuple[dict[str, Any], list[Shown]]:
     """Measure what a splat, with its thresholds and stop, costs from cameras on its device.
 
-    Args:
-        tiles: of all views together, whose fragments are weighed one by one.
-        repeats: timed frames of each timed view and cut.
-
-    Returns:
-        Figures as plain values, and the views that pictures show.
+    The fragments of ``tiles`` tiles of all views together are weighed one by one; ``repeats``
+    frames of each timed view and cut are timed. Returns figures as plain values, and the views that
+    pictures show.
     """
     survey = _Survey(model, engine)
-    chosen = _middles(len(views))
+    parts = min(SHOWN, len(views))  # the middle of each is shown: an orbit begins at a pole
+    chosen = [(2 * part + 1) * len(views) // (2 * parts) for part in range(parts)]
     each = max(1, tiles // len(views))
     steps = each + 1  # of a view: pictures, then tiles, of which small ones have fewer
     with tqdm(total=steps * len(views), desc="audit", unit="tile", disable=not progress) as bar:
@@ -182,8 +165,8 @@ def audit(
             for _ in survey.weigh(view, each):
                 bar.update()
             bar.update(steps * (number + 1) - bar.n)
-    timed: list[View] = [views[number][1] for number in chosen]
-    frames = frame_times(list(survey.candidates.values()), timed, engine, repeats=repeats)
+    timed = [views[number][1] for number in chosen]
+    frames = evaluate.frame_times([*survey.candidates.values()], timed, engine, repeats=repeats)
     return survey.figures(frames), survey.shown
 
 
@@ -200,22 +183,21 @@ class _Survey:
         self._overdraw: list[float] = []
         self._idle = Idle()
 
-    def draw(self, name: str, view: View, shown: bool) -> None:
+    def draw(self, name: str, view: View, *, shown: bool) -> None:
         """Draw a view of the model and of its cuts."""
-        engine, opacities, itself = self._engine, self._itself.splats.opacities, None
+        engine, opacities = self._engine, self._itself.splats.opacities
+        itself = self._itself.draw(engine, view, counts=True)
         for label, candidate in self.candidates.items():
-            out = candidate.draw(engine, view, counts=itself is None)
-            itself = out if itself is None else itself
+            out = itself if label == AS_IT_IS else candidate.draw(engine, view)
             error = (out.image.clamp(0, 1) - itself.image.clamp(0, 1)).square().mean()
-            counts = {key: float(getattr(out, key)) for key in _COUNTS}
-            psnr_itself = psnr(out.image, itself.image)
-            self._rows[label].append({"mse": float(error), "psnr": psnr_itself, **counts})
-        assert itself is not None
+            row = {key: float(getattr(out, key)) for key in _COUNTS}
+            row |= {"mse": float(error), "psnr": metrics.psnr(out.image, itself.image)}
+            self._rows[label].append(row)
         inputs = self._itself.inputs(view)
         squared = extents.SQRT8.squared(opacities)
         ellipses = extents.covered(engine, replace(inputs, counts=True), squared)
         self._overdraw.append(float(ellipses.fragments_per_pixel))
-        for viewer in extents.VIEWERS:
+        for viewer in VIEWERS:
             self._asked.setdefault(viewer.names, []).append(extents.shaded(engine, inputs, viewer))
         cut = self._itself.thresholds(inputs)
         if cut is not None:
@@ -227,7 +209,7 @@ class _Survey:
             self.shown.append(Shown(name, itself.image, itself.fragments, ellipses.fragments))
 
     def weigh(self, view: View, tiles: int) -> Iterator[None]:
-        """Weigh the fragments of a view, one by one; some tiles, in turns."""
+        """Weigh the fragments of some tiles of a view."""
         inputs = self._itself.inputs(view)
         for tile in fragments(inputs, self._itself.thresholds(inputs), tiles):
             if len(tile.rows):
@@ -248,7 +230,7 @@ class _Survey:
             "views": len(self._overdraw),
             "overdraw": statistics.fmean(self._overdraw),
             **{name: cuts[0][name] for name in same},
-            "frame_size": sizes([(*each.fragments.shape[::-1],) for each in self.shown]),
+            "frame_size": wording.sizes([(*each.fragments.shape[::-1],) for each in self.shown]),
             "engine": self._engine.name,
             "device": str(self._model.device),
             "idle": self._idle.as_dict(),
@@ -257,15 +239,9 @@ class _Survey:
         }
 
 
-def _middles(count: int) -> list[int]:
-    """Some evenly spread numbers, the middle ones of as many parts: an orbit begins at a pole."""
-    parts = min(SHOWN, count)
-    return [(2 * part + 1) * count // (2 * parts) for part in range(parts)]
-
-
-def _candidates(model: Model) -> dict[str, Candidate]:
+def _candidates(model: Model) -> dict[str, evaluate.Candidate]:
     """The model as it is, first, and with every cut on top."""
-    itself, own = Candidate(model), model.falloff
+    itself, own = evaluate.Candidate(model), model.falloff
     found = {AS_IT_IS: itself}
     for cut in extents.CUTS:
         thresholds = cut.thresholds(itself.splats.opacities)
@@ -274,7 +250,7 @@ def _candidates(model: Model) -> dict[str, Candidate]:
     if model.stop is None:
         found[f"a stop at {USUAL_STOP:g}"] = itself.sharing(model=model.with_rules(stop=USUAL_STOP))
     if model.pruned:
-        found[UNTRUNCATED] = Candidate(model.untruncated())
+        found[UNTRUNCATED] = evaluate.Candidate(model.untruncated())
     return found
 
 
@@ -288,17 +264,11 @@ def _mean(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 
 
 def _viewers(asked: Mapping[str, Sequence[float]]) -> list[dict[str, Any]]:
-    rules = {viewer.names: (viewer.extent.name, viewer.shape) for viewer in extents.VIEWERS}
-    rules[HONOURING] = ("quads by cutoffs, 1/255", "quad")
-    means = {names: statistics.fmean(pixels) for names, pixels in asked.items()}
-    first = means[extents.VIEWERS[0].names]
-    return [
-        {
-            "viewers": names,
-            "rule": rules[names][0],
-            "shape": rules[names][1],
-            "shaded_per_pixel": mean,
-            "against_sqrt8": mean / first if first else math.nan,
-        }
-        for names, mean in means.items()
-    ]
+    rules = {each.names: {"rule": each.extent.name, "shape": each.shape} for each in VIEWERS}
+    rules[HONOURING] = {"rule": "quads by cutoffs, 1/255", "shape": "quad"}
+    first, found = statistics.fmean(asked[VIEWERS[0].names]), []
+    for names, pixels in asked.items():
+        mean = statistics.fmean(pixels)
+        share = {"shaded_per_pixel": mean, "against_sqrt8": mean / first if first else math.nan}
+        found.append({"viewers": names, **rules[names], **share})
+    return found

@@ -30,12 +30,8 @@ FROM_PHOTOGRAPHS = (
 """What pruning with photographs gained; docs/results.md has the table."""
 
 UNKNOWN = "What learned cutoffs would save on this model is not known before they are learned"
-
 _TEMPLATE = Path(__file__).with_name("audit.html")
-
-_WORDS = 28
-"""Characters of a line of words in a terminal: two such columns and two of numbers fill 100."""
-
+_WORDS = 28  # characters of a line of words in a terminal: two such columns and two of numbers
 _KINDS = ("", "_fragments", "_overdraw")
 
 
@@ -52,10 +48,8 @@ def draw(folder: Path, shown: Sequence[Shown]) -> dict[str, Any]:
         save_map(folder / files[1], view.fragments, limit)
         save_map(folder / files[2], view.overdraw, limit)
         height, width = view.fragments.shape
-        means = {
-            "fragments_per_pixel": float(view.fragments.float().mean()),
-            "overdraw": float(view.overdraw.float().mean()),
-        }
+        maps = {"fragments_per_pixel": view.fragments, "overdraw": view.overdraw}
+        means = {key: float(each.float().mean()) for key, each in maps.items()}
         views.append(means | {"name": view.name, "width": width, "height": height, "files": files})
     return {"limit": limit, "views": views}
 
@@ -64,7 +58,7 @@ def sentence(figures: Mapping[str, Any]) -> str:
     """One line to quote."""
     idle, views = figures["idle"], "view" if figures["views"] == 1 else "views"
     drawers = "Gaussian draws" if figures["gaussians"] == 1 else "Gaussians draw"
-    cameras = _FROM[figures["cameras"]["kind"]].format(views)
+    cameras = _FROM.get(figures["cameras"]["kind"], "given {}").format(views)
     quads = figures["viewers"][0]["shaded_per_pixel"]
     return (
         f"{figures['gaussians']:,} {drawers} {figures['fragments_per_pixel']:.1f} fragments "
@@ -107,24 +101,15 @@ def text(figures: Mapping[str, Any]) -> str:
 
 def _folded(table: page.Table) -> list[str]:
     """The lines of a table in a terminal; long words fold."""
-    rows = [
-        [
-            textwrap.wrap(cell, _WORDS) or [cell] if at < table.words else [cell]
-            for at, cell in enumerate(row)
-        ]
-        for row in (table.head, *table.rows)
-    ]
-    columns = zip(*rows, strict=True)
-    widths = [max(len(line) for cell in column for line in cell) for column in columns]
-    lines = []
-    for row in rows:
-        for parts in zip_longest(*row, fillvalue=""):
-            cells = [
-                part.ljust(width) if at < table.words else part.rjust(width)
-                for at, (part, width) in enumerate(zip(parts, widths, strict=True))
-            ]
-            lines.append("  ".join(cells).rstrip())
-    return lines
+    lines: list[Sequence[str]] = []
+    for row in (table.head, *table.rows):
+        words = [textwrap.wrap(cell, _WORDS) or [cell] for cell in row[: table.words]]
+        numbers = [[cell] for cell in row[table.words :]]
+        lines += zip_longest(*words, *numbers, fillvalue="")
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    aligned = ["<"] * table.words + [">"] * (len(widths) - table.words)
+    form = "  ".join(f"{{:{side}{width}}}" for side, width in zip(aligned, widths, strict=True))
+    return [form.format(*line).rstrip() for line in lines]
 
 
 def compose(figures: Mapping[str, Any], folder: Path) -> str:
@@ -147,41 +132,30 @@ def compose(figures: Mapping[str, Any], folder: Path) -> str:
 
 def _tables(figures: Mapping[str, Any]) -> list[page.Table]:
     """Cuts, viewers, and where idle fragments sit."""
-    idle = figures["idle"]
-    first = figures["cuts"][0]["fragments_per_pixel"]
-    cuts = [
-        [
-            cut["name"],
-            f"{cut['fragments_per_pixel']:.2f}",
-            _ratio(first, cut["fragments_per_pixel"]),
-            _decibels(cut["psnr"]),
-            _decibels(cut["worst_psnr"]),
-            f"{cut['frame_ms']:.2f} ± {cut['frame_ms_se']:.2f}",
-        ]
-        for cut in figures["cuts"]
-    ]
+    idle, first, cuts = figures["idle"], figures["cuts"][0]["fragments_per_pixel"], []
+    for cut in figures["cuts"]:
+        drawn = cut["fragments_per_pixel"]
+        ratio = f"{first / drawn:.2f}x" if drawn else ""
+        decibels = [_decibels(cut[key]) for key in ("psnr", "worst_psnr")]
+        frame = f"{cut['frame_ms']:.2f} ± {cut['frame_ms_se']:.2f}"
+        cuts.append([cut["name"], f"{drawn:.2f}", ratio, *decibels, frame])
     head = ["left out", "fragments/pixel", "fewer", "against itself", "worst view", "frame, ms"]
     said = (
         f"{figures['views']} views; frames of {min(SHOWN, figures['views'])} of them, in turns, on "
         f"the {figures['engine']} engine ({figures['device']}). PSNR is that of the mean squared "
         "error over all views."
     )
-    quads = figures["viewers"][0]["shaded_per_pixel"]
-    ours = figures["evaluated_per_pixel"]
-    shading = [
-        *(
-            (each["viewers"], each["rule"], each["shaded_per_pixel"], each["against_sqrt8"])
-            for each in figures["viewers"]
-        ),
-        ("fragprune", _OURS, ours, ours / max(quads, 1e-9)),
-    ]
+    ours, quads = figures["evaluated_per_pixel"], figures["viewers"][0]["shaded_per_pixel"]
+    keys = ("viewers", "rule", "shaded_per_pixel", "against_sqrt8")
+    shading = [tuple(each[key] for key in keys) for each in figures["viewers"]]
+    shading.append(("fragprune", _OURS, ours, ours / max(quads, 1e-9)))
     viewers = [[name, rule, f"{some:.1f}", f"{share:.2f}"] for name, rule, some, share in shading]
     shaded = f"{_SHADED} Its frames of {figures['frame_size']} take {figures['frame_ms']:.1f} ms."
-    every = {"name": "all", "share": 1.0, "idle": idle["together"]}
-    reasons = [
-        [each["name"], f"{each['share']:.1%}", f"{each['idle']:.1%}", _part(each)]
-        for each in (*idle["reasons"], every)
-    ]
+    reasons = []
+    for each in (*idle["reasons"], {"name": "all", "share": 1.0, "idle": idle["together"]}):
+        share, part = each["share"], each["idle"]
+        of_these = f"{part / share:.0%}" if share else ""
+        reasons.append([each["name"], f"{share:.1%}", f"{part:.1%}", of_these])
     return [
         page.Table(head, cuts, said),
         page.Table(["viewer", "draws", "shaded/pixel", "against √8 quads"], viewers, shaded, 2),
@@ -189,23 +163,11 @@ def _tables(figures: Mapping[str, Any]) -> list[page.Table]:
     ]
 
 
-def _part(reason: Mapping[str, Any]) -> str:
-    return f"{reason['idle'] / reason['share']:.0%}" if reason["share"] else ""
-
-
-def _ratio(first: float, drawn: float) -> str:
-    return f"{first / drawn:.2f}x" if drawn else ""
-
-
 def _decibels(value: float | None) -> str:
     return "equal" if value is None or math.isinf(value) else f"{value:.1f} dB"
 
 
-_FROM = {
-    "orbit": "generated {} from all around",
-    "inside": "generated {} from inside",
-    "given": "given {}",
-}
+_FROM = {"orbit": "generated {} from all around", "inside": "generated {} from inside"}
 
 _TITLES = (
     "Simple cuts, the same for all Gaussians; PSNR is against the picture as it is",

@@ -10,7 +10,7 @@ is closed all round looks like a room: then choose.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from scipy.spatial import cKDTree
@@ -19,17 +19,13 @@ from torch import Tensor
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.plugins.hooks import drawn_by
-from fragprune_plugins.types import RasterInputs, Splats, View
+from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View
 from fragprune_plugins.workbench.figures.evaluate import bar
 from fragprune_plugins.workbench.scenes.generated import Named, around, bounds, within
 from fragprune_plugins.workbench.scenes.pinhole import look_at
 
-Side = Literal["auto", "orbit", "inside"]
-"""Where cameras go: ``auto`` chooses."""
-
-ENCLOSED = 0.5
-"""Share of directions that end on a surface from which on a place is inside."""
-
+Side = Literal["auto", "orbit", "inside"]  # where cameras go: ``auto`` chooses
+ENCLOSED = 0.5  # share of directions that end on a surface from which on a place is inside
 _AS_ASKED = "As asked for."
 _CANDIDATES = 12
 _PLACES = 4  # that cameras stand at, at most
@@ -53,8 +49,7 @@ class Placed:
     views: Named
     side: str  # "orbit" or "inside"
     why: str
-    enclosed: float | None = None
-    """Share of directions that end on a surface, from the best place; None: none was looked for."""
+    enclosed: float | None = None  # share of directions that end on a surface, from the best place
 
 
 @torch.no_grad()
@@ -63,8 +58,7 @@ def place(
 ) -> Placed:
     """Cameras all around a splat, or inside of it, by small pictures that an engine draws.
 
-    Args:
-        divide: divisor of the sides of their pictures, which have 800 pixels.
+    The sides of their pictures have 800 pixels, divided by ``divide``.
     """
     pixels = 800 // divide
     if side == "orbit":
@@ -89,18 +83,15 @@ def place(
         )
     good = [at for at, share in zip(places, shares, strict=True) if share >= _AS_GOOD * best]
     views = within(good[:_PLACES], 2 * count, pixels=pixels)  # from the most open ones
-    small = bar([_small(view) for _, view in views], "choosing cameras")
-    seen = [float(_met(engine, splats, view, near).mean()) for view in small]
+    tried = bar(views, "choosing cameras")
+    seen = [float(_met(engine, splats, _small(view), near).mean()) for _, view in tried]
     half = sorted(seen, reverse=True)[count - 1]  # doors and open sides show nothing
     chosen = [view for view, share in zip(views, seen, strict=True) if share >= half]
     return Placed(chosen[:count], "inside", why, best)
 
 
 def _orbit(splat: Model, count: int, pixels: int, engine: Engine) -> Named:
-    """Cameras all around; from above first, and of those the one that sees most.
-
-    From above is where y is less: worlds of COLMAP, which most are, have y down.
-    """
+    """Cameras all around; from above first (COLMAP has y down), the one that sees most."""
     centre, splats = bounds(splat)[0], splat.splats()
     named = around(splat, count, pixels=pixels)
     details = {n: _detail(engine, splats, view) for n, view in bar(named, "choosing cameras")}
@@ -108,12 +99,8 @@ def _orbit(splat: Model, count: int, pixels: int, engine: Engine) -> Named:
 
 
 def _detail(engine: Engine, splats: Splats, view: View) -> float:
-    """How much a small picture is filled, and how much its neighbouring pixels differ.
-
-    Backs of walls and haze show little, and so does a corner of an object.
-    """
-    view = _small(view).to(splats.device)
-    out = drawn_by(engine, RasterInputs(view, splats), None)
+    """How full a small picture is, and how much pixels differ: backs of walls show little."""
+    out = _drawn(engine, splats, _small(view))
     image = out.image.clamp(0, 1)
     differ = sum(float(image.diff(dim=dim).abs().mean()) for dim in (1, 2))
     return differ * float(out.alpha.mean())
@@ -121,6 +108,10 @@ def _detail(engine: Engine, splats: Splats, view: View) -> float:
 
 def _small(view: View) -> View:
     return replace(view, width=_PIXELS, height=_PIXELS)
+
+
+def _drawn(engine: Engine, splats: Splats, view: View) -> RasterOutputs:
+    return drawn_by(engine, RasterInputs(view.to(splats.device), splats), None)
 
 
 def _clear(splat: Model, radius: float) -> list[Tensor]:
@@ -143,26 +134,20 @@ def _clear(splat: Model, radius: float) -> list[Tensor]:
 
 
 def enclosed(engine: Engine, splats: Splats, place: Tensor, near: float) -> float:
-    """Share of directions from a place (3,) that end on something opaque beyond a distance.
-
-    A pixel's distance is the harmonic mean of its fragments' by weight: a large Gaussian in front
-    of the camera, however thin, brings it near.
+    """Share of directions from a place (3,) that end on something opaque beyond a distance: the
+    harmonic mean of a pixel's fragments' by weight, so a large thin Gaussian in front is near.
     """
     at = (torch.arange(_PIXELS) + 0.5) / _PIXELS * 2 - 1
     # What a pixel of such a view sees of the sphere, up to a factor.
     angles = (1 + at[:, None] ** 2 + at**2).pow(-1.5).flatten()
-    met = [float((_met(engine, splats, view, near) * angles).sum()) for view in _faces(place)]
+    eye = place.double().cpu()
+    ahead = [eye + eye.new_tensor(each) for each in _AHEAD]
+    faces = [look_at(eye, at, width=_PIXELS, height=_PIXELS, fov_y=90) for at in ahead]
+    met = [float((_met(engine, splats, view, near) * angles).sum()) for view in faces]
     return sum(met) / (len(met) * float(angles.sum()))
 
 
 def _met(engine: Engine, splats: Splats, view: View, near: float) -> Tensor:
     """(P,) 1 where a pixel shows something opaque beyond a distance, else 0; on the CPU."""
-    out = drawn_by(engine, RasterInputs(view.to(splats.device), splats), None)
+    out = _drawn(engine, splats, view)
     return ((out.alpha > _OPAQUE) & (out.alpha > near * out.invdepth)).flatten().float().cpu()
-
-
-def _faces(place: Tensor) -> list[View]:
-    """Six square views that together see everything."""
-    eye = place.double().cpu()
-    square: dict[str, Any] = {"width": _PIXELS, "height": _PIXELS, "fov_y": 90}
-    return [look_at(eye, eye + eye.new_tensor(ahead), **square) for ahead in _AHEAD]

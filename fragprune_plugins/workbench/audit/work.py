@@ -9,26 +9,16 @@ from typing import Any
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.hosts.photographs import Resolution
 from fragprune_plugins.learning.stage2 import evenly_spaced
-from fragprune_plugins.workbench.audit import page
+from fragprune_plugins.workbench.audit import page, placing
 from fragprune_plugins.workbench.audit.audit import audit as measured
-from fragprune_plugins.workbench.audit.placing import Placed, Side, place
-from fragprune_plugins.workbench.commands.command import Report
-from fragprune_plugins.workbench.commands.opening import (
-    open_engine,
-    over_its_background,
-    warn_if_antialiased,
-)
-from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
-from fragprune_plugins.workbench.figures.records import strict
-from fragprune_plugins.workbench.figures.wording import nothing_drawn
+from fragprune_plugins.workbench.commands import command, opening, options
+from fragprune_plugins.workbench.figures import records, wording
 from fragprune_plugins.workbench.models.model import load, writable_folder
 from fragprune_plugins.workbench.scenes.cameras import load_cameras, load_scene_cameras, sized
 from fragprune_plugins.workbench.scenes.output import cameras_of
 
 PAGE, FIGURES = "audit.html", "audit.json"
-
-LARGEST = 1600
-"""Pixels of a picture's longer side, as hosts have it: a frame of more takes long."""
+LARGEST = 1600  # pixels of a picture's longer side, as hosts have it: a frame of more takes long
 
 
 def audit(
@@ -42,22 +32,23 @@ def audit(
     resolution: int | None,
     white_background: bool,
     no_truncation: bool,
-    engine: EngineOptions,
-) -> Report:
+    engine: options.EngineOptions,
+) -> command.Report:
     """Do what ``fragprune audit`` promises; its options are the arguments."""
-    rasterizer, device = open_engine(engine)
+    rasterizer, device = opening.open_engine(engine)
     loaded = load(model, truncation=not no_truncation, device=device)
-    warn_if_antialiased(model)
+    opening.warn_if_antialiased(model)
     if out is not None:
         writable_folder(out)
     if cameras is None and data is None and orbit is None:
         cameras = cameras_of(model)
     if cameras is None and data is None:
-        side: Side = "auto" if orbit is None else "orbit" if orbit else "inside"
-        placed = place(loaded, views, rasterizer, side=side, divide=resolution or 1)
+        side: placing.Side = "auto" if orbit is None else "orbit" if orbit else "inside"
+        placed = placing.place(loaded, views, rasterizer, side=side, divide=resolution or 1)
     else:
-        scene = over_its_background(model, SceneOptions(white_background=white_background))
-        placed = _given(cameras, data, views, resolution, scene.white_background)
+        scene = options.SceneOptions(data, white_background=white_background)
+        scene = opening.over_its_background(model, scene)
+        placed = _given(cameras, scene, views, resolution)
     named = [(name, view.to(device)) for name, view in placed.views]
     measurements, shown = measured(loaded, named, engine=rasterizer, progress=True)
     figures: dict[str, Any] = {
@@ -69,35 +60,28 @@ def audit(
     }
     figures["result"] = page.sentence(figures)
     figures["pruning"] = page.pruning(figures)
-    figures["warnings"] = nothing_drawn([figures["fragments_per_pixel"]])
+    figures["warnings"] = wording.nothing_drawn([figures["fragments_per_pixel"]])
     lines = [page.text(figures), *(f"Warning: {each}" for each in figures["warnings"])]
-    if out is None:
-        return Report(figures | {"page": None}, "\n".join(lines))
-    _write(figures, out)
-    lines.append(f"Wrote {out / PAGE} and {FIGURES}.")
-    return Report(figures | {"page": str(out / PAGE)}, "\n".join(lines))
-
-
-def _write(figures: dict[str, Any], out: Path) -> None:
-    with replacing(out / FIGURES) as path:
-        path.write_text(json.dumps(strict(figures), indent=1) + "\n", encoding="utf-8")
-    with replacing(out / PAGE) as path:
-        path.write_text(page.compose(figures, out), encoding="utf-8")
+    if out is not None:
+        with replacing(out / FIGURES) as path:
+            path.write_text(json.dumps(records.strict(figures), indent=1) + "\n", encoding="utf-8")
+        with replacing(out / PAGE) as path:
+            path.write_text(page.compose(figures, out), encoding="utf-8")
+        lines.append(f"Wrote {out / PAGE} and {FIGURES}.")
+    return command.Report(figures | {"page": out and str(out / PAGE)}, "\n".join(lines))
 
 
 def _given(
-    cameras: Path | None, data: Path | None, count: int, divide: int | None, white_background: bool
-) -> Placed:
+    cameras: Path | None, scene: options.SceneOptions, count: int, divide: int | None
+) -> placing.Placed:
     """Cameras of a file or a scene folder, ``count`` at most, evenly spread."""
     if cameras is not None:
-        named = load_cameras(cameras, white_background=white_background)
+        named = load_cameras(cameras, white_background=scene.white_background)
     else:
-        assert data is not None
-        train, test = load_scene_cameras(data, white_background=white_background)
+        assert scene.data is not None
+        train, test = load_scene_cameras(scene.data, white_background=scene.white_background)
         named = sorted([*train, *test], key=lambda each: each[0])
-    every = len(named)
     chosen = list(evenly_spaced(named, count))
     longest = max(max(view.width, view.height) for _, view in chosen)
-    chosen = sized(chosen, Resolution(divide or -(-longest // LARGEST)))
-    why = f"{len(chosen)} of the {every} cameras of {cameras or data}, evenly spread."
-    return Placed(chosen, "given", why)
+    why = f"{len(chosen)} of the {len(named)} cameras of {cameras or scene.data}, evenly spread."
+    return placing.Placed(sized(chosen, Resolution(divide or -(-longest // LARGEST))), "given", why)
