@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import click
@@ -15,13 +16,10 @@ def _sizes(
     ctx: click.Context, param: click.Parameter, words: tuple[str, ...]
 ) -> list[tuple[int, int]]:
     """Width and height of each word such as 640x480."""
-    sizes = []
     for word in words:
-        width, _, height = word.partition("x")
-        if not (width.isdigit() and height.isdigit() and int(width) and int(height)):
+        if not re.fullmatch(r"0*[1-9]\d*x0*[1-9]\d*", word):
             raise click.BadParameter(f"{word!r} is not WIDTHxHEIGHT, such as 640x480.")
-        sizes.append((int(width), int(height)))
-    return sizes
+    return [(int(width), int(height)) for width, height in (word.split("x") for word in words)]
 
 
 RULES = (
@@ -38,7 +36,6 @@ RULES = (
     "sizes",
     multiple=True,
     default=("640x480", "1280x960"),
-    show_default=True,
     callback=_sizes,
     help="Image size; may be given several times.",
 )
@@ -47,7 +44,6 @@ RULES = (
     multiple=True,
     type=click.IntRange(min=1),
     default=(100_000,),
-    show_default=True,
     help="Number of Gaussians in the generated scene; may be given several times.",
 )
 @engine_options()

@@ -23,17 +23,11 @@ _ROTATION = Rotation.from_euler("xyz", (12.0, -25.0, 4.0), degrees=True).as_matr
 """World to camera."""
 _TRANSLATION = np.array([0.3, -0.2, 0.5])
 _HALF_WIDTH = 0.60  # horizontal half tangent of the camera
-
 Array = NDArray[np.float64]
 
 
 def make_scene(count: int = 100_000, seed: int = SEED) -> Model:
-    """Gaussians of SH degree 3, raw as in a PLY; deterministic.
-
-    Args:
-        count: N; more Gaussians make a denser scene, not a finer one.
-        seed: of NumPy's PCG64.
-    """
+    """Gaussians of SH degree 3, raw as in a PLY; more make a denser scene, not a finer one."""
     rng = np.random.default_rng(seed)
     camera_space = _positions(rng, count)
     world = (camera_space - _TRANSLATION) @ _ROTATION
@@ -71,14 +65,8 @@ def make_scene(count: int = 100_000, seed: int = SEED) -> Model:
 def make_view(width: int, height: int) -> View:
     """The one camera of the scene at a given size; black background."""
     focal = width / (2 * _HALF_WIDTH)
-    return View.pinhole(
-        torch.from_numpy(_ROTATION).float(),
-        torch.from_numpy(_TRANSLATION).float(),
-        width=width,
-        height=height,
-        fx=focal,
-        fy=focal,
-    )
+    pose = (torch.from_numpy(each).float() for each in (_ROTATION, _TRANSLATION))
+    return View.pinhole(*pose, width=width, height=height, fx=focal, fy=focal)
 
 
 def _positions(rng: np.random.Generator, count: int) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import platform
 import statistics
@@ -23,9 +24,7 @@ from fragprune_plugins.workbench.figures.clock import standard_error, synchroniz
 
 Pass = Literal["forward", "forward_backward"]
 PASSES: tuple[Pass, ...] = get_args(Pass)
-
-TRUNCATION = 16 / 255
-"""Threshold of all Gaussians in truncated rows; leaves 0.63 of the fragments, as learning does."""
+TRUNCATION = 16 / 255  # of all Gaussians in truncated rows; leaves 0.63 of the fragments
 
 
 @dataclass(frozen=True)
@@ -37,8 +36,7 @@ class Case:
     splats: Splats
     kind: Pass
     thresholds: Tensor | None = None
-    rules: Mapping[str, Any] = field(default_factory=dict)
-    """``Model.rules`` to draw by."""
+    rules: Mapping[str, Any] = field(default_factory=dict)  # ``Model.rules`` to draw by
 
     __repr__ = one_line
 
@@ -70,68 +68,66 @@ def measure(
     repeats: int = 9,
     say: Callable[[str], None] = lambda _: None,
 ) -> list[dict[str, Any]]:
-    """Time every case on every engine, all of them once a round.
+    """Time every case on every engine, all of them once a round, after a round of warming up.
 
-    On a GPU the clock stops when it is idle again, after the backward pass too.
-
-    Args:
-        engines: pictures are compared with those of the first one.
-        repeats: number of rounds after one warm-up round.
-
-    Returns:
-        One dict a case and engine; with stages (medians in ms), ns_per_fragment (of the median;
-        None where nothing is drawn), peak_mb (beyond inputs, of a GPU's own memory as torch gives
-        it out, else of main memory; None where the system cannot tell), difference (mean absolute,
-        from the first engine's picture).
+    On a GPU the clock stops when it is idle again. Returns one dict a case and engine; with stages
+    (medians in ms), ns_per_fragment (of the median; None where nothing is drawn), peak_mb (beyond
+    inputs, of a GPU's own memory as torch gives it out, else of main memory; None where the system
+    cannot tell), difference (mean absolute, from the first engine's picture).
     """
-    jobs = [(case, engine, _prepare(case, engine)) for case in cases for engine in engines]
-    times: list[list[float]] = [[] for _ in jobs]
-    stages: list[list[dict[str, float]]] = [[] for _ in jobs]
-    first = [_with_peak(job, case.device) for case, _, job in jobs]
+    jobs = [_Job(case, engine) for case in cases for engine in engines]
     for turn in range(repeats):
-        order = range(len(jobs)) if turn % 2 == 0 else reversed(range(len(jobs)))
-        for index in order:
-            case, _, job = jobs[index]
-            outputs, spent = timed(job, case.device)
-            times[index].append(spent)
-            parts = dict(outputs.stages or {})
-            if case.kind == "forward_backward" and parts:
-                parts["backward"] = spent - sum(parts.values())
-            stages[index].append(parts)
+        for job in jobs if turn % 2 == 0 else reversed(jobs):
+            job.time()
         say(f"round {turn + 1} of {repeats}")
-    results = []
-    for index, (case, engine, _) in enumerate(jobs):
-        outputs, peak = first[index]
-        compared, _ = first[index - index % len(engines)]
-        median = statistics.median(times[index])
+    pairs = zip(jobs, (first for first in jobs[:: len(engines)] for _ in engines), strict=True)
+    return [job.result(first.outputs.image) for job, first in pairs]
+
+
+class _Job:
+    """A case on an engine; construction draws it once, which warms up and finds the peak memory."""
+
+    def __init__(self, case: Case, engine: Engine) -> None:
+        self.case, self.engine, self.draw = case, engine, _prepare(case, engine)
+        self.times: list[float] = []
+        self.stages: list[dict[str, float]] = []
+        self.outputs, self.peak = _with_peak(self.draw, case.device)
+
+    def time(self) -> None:
+        """Draw once more, by the clock."""
+        outputs, spent = timed(self.draw, self.case.device)
+        parts = dict(outputs.stages or {})
+        if self.case.kind == "forward_backward" and parts:
+            parts["backward"] = spent - sum(parts.values())
+        self.times.append(spent)
+        self.stages.append(parts)
+
+    def result(self, compared: Tensor) -> dict[str, Any]:
+        """The figures, with the difference from another picture."""
+        case, outputs, median = self.case, self.outputs, statistics.median(self.times)
         drawn = float(outputs.fragments_per_pixel.detach())
         fragments = drawn * case.view.width * case.view.height
-        results.append(
-            {
-                "scene": case.scene,
-                "width": case.view.width,
-                "height": case.view.height,
-                "gaussians": len(case.splats),
-                "pass": case.kind,
-                "engine": engine.name,
-                "device": str(case.device),
-                "threads": torch.get_num_threads(),
-                "truncated": case.thresholds is not None,
-                "fragments_per_pixel": drawn,
-                "evaluated_per_pixel": outputs.evaluated_per_pixel,
-                "ms_median": median,
-                "ms_min": min(times[index]),
-                "ms_se": standard_error(times[index]),
-                "ns_per_fragment": 1e6 * median / fragments if fragments else None,
-                "stages": {
-                    name: statistics.median(part[name] for part in stages[index])
-                    for name in stages[index][0]
-                },
-                "peak_mb": peak,
-                "difference": float((outputs.image - compared.image).detach().abs().mean()),
-            }
-        )
-    return results
+        names = self.stages[0]
+        return {
+            "scene": case.scene,
+            "width": case.view.width,
+            "height": case.view.height,
+            "gaussians": len(case.splats),
+            "pass": case.kind,
+            "engine": self.engine.name,
+            "device": str(case.device),
+            "threads": torch.get_num_threads(),
+            "truncated": case.thresholds is not None,
+            "fragments_per_pixel": drawn,
+            "evaluated_per_pixel": outputs.evaluated_per_pixel,
+            "ms_median": median,
+            "ms_min": min(self.times),
+            "ms_se": standard_error(self.times),
+            "ns_per_fragment": 1e6 * median / fragments if fragments else None,
+            "stages": {n: statistics.median(part[n] for part in self.stages) for n in names},
+            "peak_mb": self.peak,
+            "difference": float((outputs.image - compared).detach().abs().mean()),
+        }
 
 
 def _prepare(case: Case, engine: Engine) -> Callable[[], RasterOutputs]:
@@ -142,17 +138,17 @@ def _prepare(case: Case, engine: Engine) -> Callable[[], RasterOutputs]:
     names = ("means", "opacities", "scales", "rotations", "sh")
     leaves = {n: getattr(case.splats, n).detach().clone().requires_grad_(True) for n in names}
     hook = torch.zeros(len(case.splats), 3, device=case.device, requires_grad=True)
-    thresholds = None
-    if case.thresholds is not None:
-        thresholds = case.thresholds.clone().requires_grad_(True)
+    cut = case.thresholds
+    thresholds = None if cut is None else cut.clone().requires_grad_(True)
     splats = replace(case.splats, **leaves)
     inputs = RasterInputs(case.view, splats, hook, planes=(), **case.rules)
     stream = torch.Generator().manual_seed(0)
     weight = torch.randn(3, case.view.height, case.view.width, generator=stream).to(case.device)
 
     def draw_and_differentiate() -> RasterOutputs:
-        for leaf in (*leaves.values(), hook, *([] if thresholds is None else [thresholds])):
-            leaf.grad = None
+        for leaf in (*leaves.values(), hook, thresholds):
+            if leaf is not None:
+                leaf.grad = None
         outputs = drawn_by(engine, inputs, thresholds)
         torch.autograd.backward(outputs.image, weight)
         return outputs
@@ -172,26 +168,34 @@ def _with_peak(
         return outputs, (torch.cuda.max_memory_allocated(device) - start) / 2**20
     try:
         Path("/proc/self/clear_refs").write_text("5")  # Linux: forget the old peak
-        before = _status("VmRSS")
+        before = _kilobytes("VmRSS")
         outputs = job()
-        return outputs, max(0.0, _status("VmHWM") - before)
+        return outputs, max(0.0, _kilobytes("VmHWM") - before) / 1024
     except OSError:
         return job(), None
 
 
-def _status(field: str) -> float:
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith(field):
-            return float(line.split()[1]) / 1024
-    raise OSError(f"no {field} in /proc/self/status")
+def _kilobytes(name: str) -> float:
+    return float(_told("/proc/self/status", name).split()[0])
+
+
+def _told(path: str, name: str) -> str:
+    """What a file such as /proc/cpuinfo first says behind a name; OSError if it does not."""
+    for line in Path(path).read_text().splitlines():
+        key, _, value = line.partition(":")
+        if key.strip() == name:
+            return value.strip()
+    raise OSError(f"no {name} in {path}")
 
 
 def describe_machine(device: torch.device | str = "cpu") -> dict[str, Any]:
     """The processor, and the versions that decide about speed."""
     device = torch.device(device)
-    native = binding.chosen()
+    native, processor = binding.chosen(), platform.processor() or platform.machine()
+    with contextlib.suppress(OSError):
+        processor = _told("/proc/cpuinfo", "model name")
     return {
-        "processor": _processor(),
+        "processor": processor,
         "cores": os.cpu_count(),
         "platform": platform.platform(),
         "torch": torch.__version__,
@@ -203,13 +207,3 @@ def describe_machine(device: torch.device | str = "cpu") -> dict[str, Any]:
 def load_average() -> float | None:
     """Processes that run or wait, mean over a minute; None where the system does not tell."""
     return os.getloadavg()[0] if hasattr(os, "getloadavg") else None
-
-
-def _processor() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()

@@ -15,16 +15,12 @@ from fragprune_plugins.errors import UsageError
 from fragprune_plugins.plugins.hooks import thresholds_for
 from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.bench import timing
-from fragprune_plugins.workbench.commands.command import Report
-from fragprune_plugins.workbench.commands.opening import open_engine
-from fragprune_plugins.workbench.commands.options import EngineOptions
+from fragprune_plugins.workbench.commands import command, opening, options
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
 from fragprune_plugins.workbench.scenes.output import cameras_of
 
-REPEATS = 9
-"""Timed frames of each row."""
-
+REPEATS = 9  # timed frames of each row
 Size = tuple[int, int]
 
 
@@ -34,10 +30,10 @@ def bench(
     cameras: Path | None,
     sizes: list[Size],
     gaussians: tuple[int, ...],
-    engine: EngineOptions,
-) -> Report:
+    engine: options.EngineOptions,
+) -> command.Report:
     """Do what ``fragprune bench`` promises; its options are the arguments."""
-    rasterizer, device = open_engine(engine)
+    rasterizer, device = opening.open_engine(engine)
     before = timing.load_average()
     if model is None:
         scenes = product(gaussians, sizes)
@@ -49,7 +45,7 @@ def bench(
     loads = {"load_before": before, "load_after": timing.load_average()}
     machine = timing.describe_machine(device) | loads
     data = {"results": results, "saved": _saved(results), "machine": machine}
-    return Report(data, _table(data))
+    return command.Report(data, _table(data))
 
 
 def _of_model(
@@ -73,12 +69,7 @@ def _of_model(
 
 
 def _saved(results: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """How much of the saved fragments becomes saved time, by scene and size, forward pass.
-
-    Returns:
-        For each "scene WIDTHxHEIGHT": ``fragments`` and ``time``, the ratios of untruncated to
-        truncated, and ``share``, time over fragments.
-    """
+    """By "scene WIDTHxHEIGHT": ratios of fragments and of time, forward; time over fragments."""
     forward, found = [row for row in results if row["pass"] == "forward"], {}
     for plain, cut in zip(forward[::2], forward[1::2], strict=True):
         if cut["fragments_per_pixel"] > 0:

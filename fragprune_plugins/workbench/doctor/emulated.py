@@ -20,7 +20,6 @@ from fragprune_plugins.engines.cuda import kernels
 from fragprune_plugins.errors import KernelError
 
 EMULATION: Final = Path(native.__file__).parent / "emulation"
-
 _COMPILERS: Final = ("g++", "c++", "clang++")
 _FLAGS: Final = (
     *("-std=c++17", "-O1", "-w", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared"),
@@ -45,10 +44,7 @@ def version_of(compiler: str) -> str:
 
 
 class EmulatedDevice:
-    """Builds a source once per set of macros, for all processes that share the folder.
-
-    The compiler is one of C++17 for ELF systems; it may get further flags.
-    """
+    """Builds a source once per set of macros, by a C++17 compiler for ELF systems, in a folder."""
 
     kind = "cpu"
 
@@ -68,18 +64,14 @@ class EmulatedDevice:
         blocks: int,
         arguments: ctypes.Structure,
     ) -> None:
-        """Run a kernel to its end.
+        """Run a kernel to its end; KernelError if its source does not compile.
 
-        Raises:
-            KernelError: its source does not compile.
-            RuntimeError: its threads wait for each other forever, or meet at different operations.
+        If its threads wait for each other forever, or meet at different operations, RuntimeError.
         """
         self.launched.append((kernel, macros))
         library = self._open(source, macros)
-        status = library.emulated_launch(
-            kernel.encode(), blocks, 256, ctypes.byref(arguments), self.seed, self.resident
-        )
-        if status:
+        grid, order = (blocks, 256), (self.seed, self.resident)
+        if library.emulated_launch(kernel.encode(), *grid, ctypes.byref(arguments), *order):
             raise RuntimeError(library.emulated_message().decode())
 
     def source(self, name: str) -> Path:
@@ -118,10 +110,8 @@ class EmulatedDevice:
             subprocess.run(command, check=True, capture_output=True, text=True, errors="replace")
         except (OSError, subprocess.CalledProcessError) as error:
             said = getattr(error, "stderr", None) or str(error)
-            raise KernelError(
-                f"the emulation of {path.stem}",
-                next((line for line in said.splitlines() if "error" in line), said.strip()),
-                f"sources that {self.compiler} compiles as C++17",
-                "Name another compiler with CXX, such as g++.",
-            ) from error
+            found = next((line for line in said.splitlines() if "error" in line), said.strip())
+            expected = f"sources that {self.compiler} compiles as C++17"
+            remedy = "Name another compiler with CXX, such as g++."
+            raise KernelError(f"the emulation of {path.stem}", found, expected, remedy) from error
         mine.replace(path)

@@ -19,21 +19,21 @@ from fragprune_plugins.errors import EngineError
 from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats
 from fragprune_plugins.workbench.doctor.work import package_version
 
+Draw = Callable[[RasterInputs, Splats], tuple[Tensor, Tensor]]  # picture (3, H, W), radii (N,)
+
 
 @dataclass
 class Peer:
     """Another rasterizer as an engine."""
 
     name: str  # of its package
-    draw: Callable[[RasterInputs, Splats], tuple[Tensor, Tensor]]
-    """Gives the picture (3, H, W) and the radii (N,)."""
+    draw: Draw
 
     def rasterize(self, inputs: RasterInputs, thresholds: Tensor | None) -> RasterOutputs:
         """Draw the splats; raises EngineError with thresholds, which it does not know."""
         if thresholds is not None or not isinstance(inputs.splats, Splats):
-            raise EngineError(
-                f"engine '{self.name}'", "thresholds", "Gaussians without any", "Leave them out."
-            )
+            where, expected = f"engine '{self.name}'", "Gaussians without any"
+            raise EngineError(where, "thresholds", expected, "Leave them out.")
         image, radii = self.draw(inputs, inputs.splats)
         return RasterOutputs(
             image=image,
@@ -75,12 +75,9 @@ def _hosts(inputs: RasterInputs, splats: Splats) -> tuple[Tensor, Tensor]:
         "antialiasing": False,
     }
     if foreign := set(kind._fields) - known.keys():
-        raise EngineError(
-            "engine 'diff_gaussian_rasterization'",
-            f"settings {', '.join(sorted(foreign))}",
-            "those of 3DGS",
-            "It is another rasterizer by the same name: nothing to compare with.",
-        )
+        found = f"settings {', '.join(sorted(foreign))}"
+        remedy = "It is another rasterizer by the same name: nothing to compare with."
+        raise EngineError("engine 'diff_gaussian_rasterization'", found, "those of 3DGS", remedy)
     settings = kind(**{name: known[name] for name in kind._fields})
     hook = inputs.means2d_hook
     image, radii, *_ = module.GaussianRasterizer(settings)(
@@ -119,8 +116,5 @@ def _gsplat(inputs: RasterInputs, splats: Splats) -> tuple[Tensor, Tensor]:
     return images[0].permute(2, 0, 1), radii if radii.ndim == 1 else radii.amax(1)
 
 
-PEERS: dict[str, Callable[[RasterInputs, Splats], tuple[Tensor, Tensor]]] = {
-    "diff_gaussian_rasterization": _hosts,
-    "gsplat": _gsplat,
-}
+PEERS: dict[str, Draw] = {"diff_gaussian_rasterization": _hosts, "gsplat": _gsplat}
 """By the name of the package: how it draws."""

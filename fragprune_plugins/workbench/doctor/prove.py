@@ -35,13 +35,8 @@ from fragprune_plugins.types import RasterInputs, Splats, one_line
 from fragprune_plugins.workbench.bench import timing
 from fragprune_plugins.workbench.bench.scene import make_scene, make_view
 from fragprune_plugins.workbench.commands.command import Report
-from fragprune_plugins.workbench.doctor import peers
-from fragprune_plugins.workbench.doctor.emulated import (
-    EMULATION,
-    EmulatedDevice,
-    find_compiler,
-    version_of,
-)
+from fragprune_plugins.workbench.doctor import emulated, peers
+from fragprune_plugins.workbench.doctor.emulated import EmulatedDevice, find_compiler, version_of
 
 FORMAT = "fragprune-proof 2"
 
@@ -65,12 +60,7 @@ class Contestant:
 
 
 def prove(say: Callable[[str], None] | None = None, repeats: int = 9) -> Report:
-    """Check, then time; ``fragprune doctor --prove``.
-
-    Args:
-        say: is told how far it is; None tells stderr.
-        repeats: timed frames of each row.
-    """
+    """Check, then time ``repeats`` frames of each row; ``say``, else stderr, is told how far."""
     say = say or partial(click.echo, err=True)
     kind = "cuda" if torch.cuda.is_available() else "cpu"
     contestants, left_out = list(_ours(kind)), {}
@@ -129,10 +119,8 @@ def _check(contestant: Contestant, kind: str) -> dict[str, Any]:
     if not contestant.ours:
         return found | {"differences": list(peer_differences(contestant.engine, where))}
     rows = [held(contestant.engine, where, scene) for scene in scenes()]
-    return found | {
-        "differences": [each for row in rows for each in row["differences"]],
-        "scenes": rows,
-    }
+    differences = [each for row in rows for each in row["differences"]]
+    return found | {"differences": differences, "scenes": rows}
 
 
 def _emulation(say: Callable[[str], None]) -> dict[str, Any]:
@@ -181,15 +169,13 @@ def _times(
 
 def _hashes() -> dict[str, str]:
     """What was proved: the compiled libraries, the kernels' sources, the timed scene."""
-    found = {
-        build: _digest(Path(binding.open_build(build).path).read_bytes())
-        for build in binding.usable_builds()
-    }
+    paths = {build: Path(binding.open_build(build).path) for build in binding.usable_builds()}
+    found = {build: _digest(path.read_bytes()) for build, path in paths.items()}
     scene = make_scene(1000)
     numbers = b"".join(t.numpy().tobytes() for t in (scene.xyz, scene.opacity, scene.scaling))
     return found | {
         "kernels": _digest(kernels.digest_of_sources()),
-        "emulation": _digest(b"".join(p.read_bytes() for p in sorted(EMULATION.iterdir()))),
+        "emulation": _digest(b"".join(map(Path.read_bytes, sorted(emulated.EMULATION.iterdir())))),
         "scene": _digest(numbers),
     }
 
@@ -231,10 +217,8 @@ def _text(data: dict[str, Any]) -> str:
 
 def _table(rows: Sequence[dict[str, Any]]) -> str:
     """Times in turns; a ratio is that to the untruncated row of the same engine."""
-    lines = [
-        f"{'engine':<28}{'size':>11}  {'pass':<17}{'cutoffs':<8}{'median, ms':>11}{'±':>9}"
-        f"{'as fast':>9}"
-    ]
+    form = "{:<28}{:>11}  {:<17}{:<8}{:>11}{:>9}{:>9}"
+    lines = [form.format("engine", "size", "pass", "cutoffs", "median, ms", "±", "as fast")]
     plain: dict[tuple[str, ...], float] = {}
     for row in rows:
         key, took = (row["round"], row["engine"], row["scene"], row["pass"]), row["ms_median"]
@@ -243,26 +227,18 @@ def _table(rows: Sequence[dict[str, Any]]) -> str:
             cut, faster = "yes", f"{plain[key] / took:.2f}x"
         else:
             plain[key] = took
-        size = f"{row['width']}x{row['height']}"
-        lines.append(
-            f"{row['engine']:<28}{size:>11}  {row['pass']:<17}{cut:<8}{took:>11.2f}"
-            f"{row['ms_se']:>9.2f}{faster:>9}".rstrip()
-        )
+        size, times = f"{row['width']}x{row['height']}", (f"{took:.2f}", f"{row['ms_se']:.2f}")
+        lines.append(form.format(row["engine"], size, row["pass"], cut, *times, faster).rstrip())
     return "\n".join(lines)
 
 
 MISCOUNTED = 1 / 500
-"""The share of pixels whose fragments may be counted otherwise.
-
-A fragment within rounding of its cut, a millionth of its falloff, is drawn by one and not by the
-other. That is one pixel in thousands; an error of a thousandth is seen in one in a hundred.
-"""
+"""The share of pixels whose fragments may be counted otherwise: within rounding of a cut it is one
+in thousands; an error of a thousandth is seen in one in a hundred."""
 
 PEER_PICTURE_DB, PEER_GRADIENT = 50.0, 0.01
-"""Peers end Gaussians at other radii: what their pictures and gradients may differ by.
-
-PSNR of the picture, and the relative L2 error of each gradient.
-"""
+"""PSNR of the picture and relative L2 error of each gradient that peers may be off by, which end
+Gaussians at other radii."""
 
 _LEARNED = ("means", "opacities", "scales", "rotations", "sh")
 _FAILURES = (FragpruneError, RuntimeError, TypeError, AttributeError)
@@ -346,9 +322,8 @@ def _drawn(engine: Engine, inputs: RasterInputs, thresholds: Tensor | None) -> d
 def learned(engine: Engine, inputs: RasterInputs) -> dict[str, Tensor]:
     """The picture without thresholds, and its gradients by name; on the CPU."""
     assert isinstance(inputs.splats, Splats)
-    leaves = {
-        name: getattr(inputs.splats, name).detach().clone().requires_grad_() for name in _LEARNED
-    }
+    given = {name: getattr(inputs.splats, name).detach() for name in _LEARNED}
+    leaves = {name: each.clone().requires_grad_() for name, each in given.items()}
     image = engine.rasterize(replace(inputs, splats=replace(inputs.splats, **leaves)), None).image
     asked = torch.rand(image.shape, generator=torch.Generator().manual_seed(0)) - 0.3
     torch.autograd.backward(image, asked.to(image))

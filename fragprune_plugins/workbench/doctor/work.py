@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import platform
 import re
 from importlib.metadata import PackageNotFoundError, version
@@ -17,7 +18,6 @@ from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.workbench.commands.command import Report, expect_numpy
 
 _PACKAGES = ("fragprune-plugins", "torch", "numpy", "pluggy", "wrapt", "plyfile", "scikit-image")
-
 _AGREES = {"agrees": True, "fails": False, "could not run": None}
 
 
@@ -39,11 +39,7 @@ def examine() -> Report:
         "threads": torch.get_num_threads(),
         "native": native,
         "gpu": gpu,
-        "engines": [
-            "reference",
-            *(["cpu"] if binding.available() else []),
-            *(["cuda"] if gpu["available"] else []),
-        ],
+        "engines": ["reference"] + ["cpu"] * native["available"] + ["cuda"] * gpu["available"],
         "adapters": [adapter.name for adapter in plugins.adapters],
         "findings": [finding.as_dict() for finding in plugins.findings],
     }
@@ -60,8 +56,8 @@ def examine() -> Report:
         f"adapters: {', '.join(data['adapters']) or 'none'}",
         *(str(finding) for finding in plugins.findings),
     ]
-    wrong = not binding.available() or any(f.level == "error" for f in plugins.findings)
-    if not binding.available():
+    wrong = not native["available"] or any(f.level == "error" for f in plugins.findings)
+    if not native["available"]:
         lines.append(
             "The cpu engine is missing, so the slow reference engine draws on the CPU. "
             "Install a C++17 compiler and install fragprune-plugins again."
@@ -82,9 +78,8 @@ def build(architectures: str) -> Report:
     try:
         codes = [int(code.strip().removeprefix("sm_")) for code in architectures.split(",")]
     except ValueError:
-        raise UsageError(
-            "--build-cuda", architectures, "compute capabilities like 80,90", "List numbers."
-        ) from None
+        expected = "compute capabilities like 80,90"
+        raise UsageError("--build-cuda", architectures, expected, "List numbers.") from None
     built: list[dict[str, Any]] = []
     try:
         compiler = kernels.compiler()
@@ -95,12 +90,8 @@ def build(architectures: str) -> Report:
                 for name, needs in resources(image.log).items():
                     built.append({"target": target, "kernel": name, "kept": had, **needs})
     except kernels.Unavailable as why:
-        raise EngineError(
-            "--build-cuda",
-            str(why),
-            "NVRTC, through cuda-bindings",
-            "Install fragprune-plugins[cuda12] or [cuda13], and torch or nvidia-cuda-nvrtc.",
-        ) from why
+        remedy = "Install fragprune-plugins[cuda12] or [cuda13], and torch or nvidia-cuda-nvrtc."
+        raise EngineError("--build-cuda", str(why), "NVRTC, through cuda-bindings", remedy) from why
     folder = str(kernels.cache_folder())
     data = {"compiler": f"{compiler.name} {compiler.version}", "kept": folder, "kernels": built}
     lines = [f"{data['compiler']}, kept in {folder}"]
@@ -145,11 +136,9 @@ def _cpu_engine() -> dict[str, Any]:
 
 def _cuda_engine() -> dict[str, Any]:
     """How kernels reach the GPU, or why they cannot."""
-    try:
+    route = None
+    with contextlib.suppress(kernels.Unavailable):
         found = kernels.compiler()
-    except kernels.Unavailable:
-        route = None
-    else:
         route = f"{found.name} {found.version}"
     seen = torch.cuda.is_available()
     return {
@@ -185,15 +174,10 @@ def resources(log: str) -> dict[str, dict[str, int]]:
     bytes stored there and loaded again; shared, bytes of shared memory of a block.
     """
     found = {}
-    for part in re.split(r"Compiling entry function '", log)[1:]:
-        name = part.split("'", 1)[0]
-        stack, stores, loads = re.findall(r"(\d+) bytes (?:stack|spill)", part)[:3]
-        registers = re.search(r"Used (\d+) registers", part)
-        shared = re.search(r"(\d+) bytes smem", part)
-        found[name] = {
-            "registers": int(registers[1]) if registers else 0,
-            "stack": int(stack),
-            "spills": int(stores) + int(loads),
-            "shared": int(shared[1]) if shared else 0,
-        }
+    for part in log.split("Compiling entry function '")[1:]:
+        stack, stores, loads = map(int, re.findall(r"(\d+) bytes (?:stack|spill)", part)[:3])
+        (registers,) = re.findall(r"Used (\d+) registers", part)[:1] or (0,)
+        (shared,) = re.findall(r"(\d+) bytes smem", part)[:1] or (0,)
+        needs = {"registers": int(registers), "stack": stack, "spills": stores + loads}
+        found[part.split("'", 1)[0]] = needs | {"shared": int(shared)}
     return found
