@@ -37,9 +37,7 @@ def command() -> Report:
         for adapter in plugins.adapters
     ]
     lines = [
-        f"{adapter.name:<16} {adapter.info.title}, github {adapter.info.repo}: "
-        f"{adapter.info.states}"
-        for adapter in plugins.adapters
+        "{name:<16} {title}, github {repo}: {states}".format(**adapter) for adapter in adapters
     ] or ["No adapter is installed."]
     lines += [str(finding) for finding in plugins.findings]
     data = {"adapters": adapters, "findings": [f.as_dict() for f in plugins.findings]}
@@ -48,10 +46,7 @@ def command() -> Report:
 
 
 def scripts(adapter: HostAdapter) -> tuple[str, ...]:
-    """Training scripts: paths in the checkout or modules of the package; () for a library.
-
-    They are the same for all revisions.
-    """
+    """Training scripts, of any revision: paths in the checkout or modules of the package."""
     if not isinstance(adapter, ScriptAdapter):
         return (adapter.info.usage,) if adapter.info.usage else ()
     return adapter.command_line(HostRepo(Path("/nonexistent"))).scripts

@@ -15,8 +15,7 @@ from fragprune_plugins.plugins.points import load, offered
 from fragprune_plugins.workbench.commands.command import Command, Report
 from fragprune_plugins.workbench.commands.options import FILE
 
-GROUP = "fragprune.bridges"
-"""Entry points: a viewer's name, and the package whose ``MODULE`` is its JavaScript module."""
+GROUP = "fragprune.bridges"  # entry points: a viewer, and the package whose ``MODULE`` it is
 
 
 @click.command("bridge", cls=Command)

@@ -28,27 +28,20 @@ def check(*, hosts: tuple[Path, ...], adapter: str | None) -> Report:
     """Do what ``fragprune check`` promises; its options are the arguments."""
     for host in hosts:
         if not host.is_dir() and HostRepo.installed(str(host)) is None:
-            raise UnknownHostError(
-                str(host),
-                "neither a folder nor an installed package",
-                "a host's checkout, or the import name of an installed host",
-                "Name the folder of train.py.",
-            )
+            found = "neither a folder nor an installed package"
+            expected = "a host's checkout, or the import name of an installed host"
+            raise UnknownHostError(str(host), found, expected, "Name the folder of train.py.")
         if (host / ARGUMENTS).is_file() and not any(host.glob("*.py")):
-            raise UnknownHostError(
-                str(host),
-                "the output folder of a training",
-                "a host's checkout",
-                f"Name the folder of train.py. For the model: fragprune audit {quoted(host)}",
-            )
+            found = "the output folder of a training"
+            remedy = f"Name the folder of train.py. For the model: fragprune audit {quoted(host)}"
+            raise UnknownHostError(str(host), found, "a host's checkout", remedy)
     plugins = load_plugins()
     adapters = plugins.adapters
     if adapter is not None:
         adapters = [a for a in adapters if a.name == adapter.replace("_", "-")]
         if not adapters:
-            raise UnknownHostError(
-                "--adapter", repr(adapter), "an installed adapter", "Run fragprune adapters."
-            )
+            expected, remedy = "an installed adapter", "Run fragprune adapters."
+            raise UnknownHostError("--adapter", repr(adapter), expected, remedy)
     if len(hosts) > 1:
         return _table(hosts, adapters, plugins)
     return _single(hosts[0], adapters, adapter, plugins)
@@ -94,10 +87,7 @@ def _single(
         "fits": fits.name if fits else None,
         "proved": proved,
         "failed": failed,
-        "missing": [
-            {"module": each.module, "distribution": each.distribution, "at": each.at}
-            for each in missing
-        ],
+        "missing": [vars(each) | {"distribution": each.distribution} for each in missing],
         "adapters": [_as_dict(*each) for each in tried.items()],
     }
     return Report(data, "\n".join(lines), exit_code=0 if fits and not failed else 1)
@@ -123,13 +113,14 @@ def _table(hosts: tuple[Path, ...], adapters: list[HostAdapter], plugins: Plugin
 
 
 _NEAREST = 3  # adapters that are named where none fits
-
 _KINDS = ("fits", "several", "inside", "finetune", "never")
 
 
 def _in_short(tried: list[Match], fitting: list[Match], differs: Sequence[str]) -> list[str]:
     """A line for each adapter that fits; else how the nearest differs, and the next reasons."""
-    shown = fitting or _nearest(tried)
+    reasons = {m.errors[0].found: m for m in reversed(tried) if m.held and m.errors}
+    nearest = [each for each in tried if each in reasons.values()]  # of one reason the first
+    shown = fitting or nearest[:_NEAREST]
     if not shown:
         return [f"None of {len(tried)} adapters knows anything of it."]
     ancestors = [each for each in tried if each.fits and each not in shown]
@@ -138,15 +129,6 @@ def _in_short(tried: list[Match], fitting: list[Match], differs: Sequence[str]) 
     lines += [each.brief() for each in (shown if fitting else shown[1:])]
     lines += [_beside(each, fitting) for each in ancestors]
     return lines + ([f"{others} others do not fit (--adapter NAME says why)."] if others else [])
-
-
-def _nearest(tried: list[Match]) -> list[Match]:
-    """The adapters that come nearest, of several with the same reason the first."""
-    reasons: dict[str, Match] = {}
-    for each in tried:
-        if each.held and each.errors:
-            reasons.setdefault(each.errors[0].found, each)
-    return list(reasons.values())[:_NEAREST]
 
 
 def _beside(match: Match, fitting: Iterable[Match]) -> str:
@@ -188,13 +170,8 @@ def _as_dict(adapter: HostAdapter, match: Match) -> dict[str, Any]:
         "findings": [finding.as_dict() for finding in match.findings],
         "limits": list(adapter.info.limits),
         "seams": [
-            {
-                "role": state.seam.role.name,
-                "seam": str(state.seam),
-                "status": state.status,
-                "at": state.at,
-            }
-            for state in match.seams
+            {"role": s.seam.role.name, "seam": str(s.seam), "status": s.status, "at": s.at}
+            for s in match.seams
         ],
     }
 
@@ -207,10 +184,7 @@ def _missing(repo: HostRepo, adapter: ScriptAdapter) -> list[Missing]:
 
 
 def _kept(repo: HostRepo, dialect: Dialect) -> list[Proof]:
-    """The kept proofs of a host's compiled packages as they are installed or vendored now.
-
-    None that failed for a host that is known to draw otherwise.
-    """
+    """The kept proofs of a host's compiled packages as they are installed or vendored now."""
     found: dict[str, Proof] = {}
     for name in sorted(dialect.names()):
         file = repo.path(name)
@@ -221,16 +195,14 @@ def _kept(repo: HostRepo, dialect: Dialect) -> list[Proof]:
         for path in sorted(pattern.parent.glob(pattern.name)) if pattern else ():
             proof = proofs.read(path)
             excused = proof and proof.failed and dialect.prover and dialect.prover.otherwise
-            if proof is not None and not excused:
+            if proof is not None and not excused:  # a host that is known to draw otherwise
                 found[str(proof)] = proof
     return list(found.values())
 
 
 def _repository(host: Path, adapters: list[HostAdapter], name: str | None) -> HostRepo:
     """The installed package, if that is meant or used; else the folder, and nothing outside it."""
-
-    package = None if host.is_dir() else HostRepo.installed(str(host))
-    if package is not None:
+    if not host.is_dir() and (package := HostRepo.installed(str(host))) is not None:
         return package
     repo = HostRepo(host)  # read once, also by the table
     try:
@@ -262,6 +234,8 @@ def _conclusion(repo: HostRepo, fitting: Collection[HostAdapter]) -> str:
     )
 
 
+_PLAIN = "No adapter fits, but its PLY is plain 3DGS, and this prunes it:"
+_BY_RUN = "fragprune run in front of its training command does both"
 _PLY = "OUTPUT/point_cloud/iteration_30000/point_cloud.ply"
 _SHOWN = 8
 
@@ -281,14 +255,13 @@ class Verdict:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, for ``--json``."""
-        return {
+        known: dict[str, Any] = {
             "verdict": self.kind,
             "sentence": self.sentence,
             "reason": self.reason,
-            "nearest": self.adapter,
-            "differs": list(self.differs),
-            "inside": dict(self.inside),
         }
+        known |= {"nearest": self.adapter, "differs": list(self.differs)}
+        return known | {"inside": dict(self.inside)}
 
 
 def judge(
@@ -323,15 +296,9 @@ def judge(
         plain = next(filter(None, found), next(iter(found), own))
     if plain:
         shown = "--self" if plain.unlike else "--data SCENE"
-        sentence = (
-            "No adapter fits, but its PLY is plain 3DGS, and this prunes it: "
-            f"fragprune finetune {_PLY} {shown} --out pruned.ply"
-        )
+        sentence = f"{_PLAIN} fragprune finetune {_PLY} {shown} --out pruned.ply"
         if plain is own:  # what a folder saves, run does not look for
-            sentence += (
-                " (fragprune run in front of its training command does both: it trains as it is, "
-                "then that follows)"
-            )
+            sentence += f" ({_BY_RUN}: it trains as it is, then that follows)"
         if plain.unlike:
             sentence += f". Photographs are left out: {plain.unlike}"
         return Verdict("finetune", sentence, plain.unlike, name, differs, inside)
@@ -387,5 +354,6 @@ def _inside(
     found = []
     for each in others:
         tried = attempt(HostRepo(repo.root / each.folder), adapters)
-        found += [(each.folder, fits.name) for fits in [*closest(tried, adapters)][:1]]
+        if fits := next(iter(closest(tried, adapters)), None):
+            found.append((each.folder, fits.name))
     return tuple(found)
