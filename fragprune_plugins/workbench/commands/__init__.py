@@ -15,8 +15,7 @@ from fragprune_plugins.errors import PathError, PluginError
 from fragprune_plugins.plugins.points import load, offered
 from fragprune_plugins.workbench.commands.command import Command, Group
 
-GROUP = "fragprune.commands"
-"""The entry-point group of commands: a click command each, ours and those of other packages."""
+GROUP = "fragprune.commands"  # entry points: a click command each, ours and other packages'
 
 
 class _Commands(Group):
@@ -51,7 +50,9 @@ def _broken(name: str, error: PluginError) -> click.Command:
     )
 
 
-@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(
+    cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "show_default": True}
+)
 @click.version_option(package_name="fragprune-plugins", prog_name="fragprune")
 def cli() -> None:
     """Learned fragment pruning for Gaussian splatting: the same picture from fewer fragments.

@@ -14,25 +14,15 @@ from typing import Any
 
 import click
 
-from fragprune_plugins.errors import (
-    EngineError,
-    FragpruneError,
-    Interrupted,
-    MemoryLimitError,
-    PathError,
-    Terminated,
-    UsageError,
-    printable,
-)
+from fragprune_plugins import errors
+from fragprune_plugins.errors import FragpruneError, UsageError, printable
 from fragprune_plugins.learning.interruption import EXIT_CODE, Terminate
 from fragprune_plugins.workbench.commands.rules import Rules
 from fragprune_plugins.workbench.figures.records import strict
 from fragprune_plugins.workbench.ranks import launched, should_print
 
-JSON = "fragprune.json"
-"""Key of a bool in the context's ``meta``: stdout gets only one JSON object."""
-WORDS = "fragprune.words"
-"""Key of the command's words there."""
+JSON = "fragprune.json"  # key of a bool in the context's ``meta``: stdout gets only one JSON object
+WORDS = "fragprune.words"  # key of the command's words there
 
 
 @dataclass(frozen=True)
@@ -99,10 +89,7 @@ class Command(click.Command):
 
 
 def work_of(package: str, **options: Any) -> Report:
-    """Do a command's work: the function of the package's name in ``work.py`` beside it.
-
-    It is imported on use, so that ``fragprune --help`` needs no torch.
-    """
+    """Do a command's work, of its package's ``work.py``, imported on use: --help needs no torch."""
     name = package.rpartition(".")[2]
     work: Callable[..., Report] = getattr(import_module(f"{package}.work"), name)
     expect_numpy()
@@ -110,11 +97,7 @@ def work_of(package: str, **options: Any) -> Report:
 
 
 def expect_numpy() -> None:
-    """Refuse a NumPy that torch cannot use: torch before 2.3 was compiled for NumPy 1.
-
-    Raises:
-        EngineError: what is wrong, and what to install.
-    """
+    """Raise EngineError for a NumPy 2 that torch cannot use: before 2.3 it was compiled for 1."""
     torch, numpy = sys.modules.get("torch"), sys.modules.get("numpy")
     if torch is None or numpy is None:
         return
@@ -123,7 +106,7 @@ def expect_numpy() -> None:
     except RuntimeError as error:
         found = f"NumPy {numpy.__version__}, for which it was not compiled"
         remedy = 'Run: pip install "numpy<2"'
-        raise EngineError(f"torch {torch.__version__}", found, "NumPy 1", remedy) from error
+        raise errors.EngineError(f"torch {torch.__version__}", found, "NumPy 1", remedy) from error
 
 
 class Group(click.Group):
@@ -148,7 +131,7 @@ def _stated(error: FragpruneError, *, as_json: bool) -> click.exceptions.Exit:
     if should_print():
         text = json.dumps({"error": error.as_dict()}) if as_json else str(error)
         click.echo(text, err=not as_json)
-    codes = {UsageError: 2, Interrupted: 130, Terminated: EXIT_CODE}
+    codes = {UsageError: 2, errors.Interrupted: 130, errors.Terminated: EXIT_CODE}
     return click.exceptions.Exit(codes.get(type(error), 1))
 
 
@@ -166,12 +149,10 @@ def _machine_stated(where: str) -> Iterator[None]:
     except OSError as error:
         if not (error.filename or isinstance(error, FileNotFoundError)):  # a closed pipe, for one
             raise
-        raise PathError(
-            str(error.filename or where),
-            error.strerror or str(error),
-            "a path that the system takes",
-            "Choose another name or place, or free space and permissions there.",
-        ) from error
+        found, expected = error.strerror or str(error), "a path that the system takes"
+        remedy = "Choose another name or place, or free space and permissions there."
+        path = str(error.filename or where)
+        raise errors.PathError(path, found, expected, remedy) from error
     except (MemoryError, RuntimeError) as error:
         words = str(error).split("\n", 1)[0][:200]
         known = "allocate memory" in words or "out of memory" in words  # torch's, of CPU and GPU
@@ -179,7 +160,8 @@ def _machine_stated(where: str) -> Iterator[None]:
             raise
         found = f"no memory left ({words or 'MemoryError'})"
         remedy = "Close other programs, or lower the pictures' size with --resolution."
-        raise MemoryLimitError(where, found, "a model and pictures that fit", remedy) from error
+        fits = "a model and pictures that fit"
+        raise errors.MemoryLimitError(where, found, fits, remedy) from error
 
 
 def usage_error(error: click.UsageError, words: list[str]) -> Exception:
@@ -196,12 +178,9 @@ def usage_error(error: click.UsageError, words: list[str]) -> Exception:
 @contextlib.contextmanager
 def first_process_prints() -> Iterator[None]:
     """Inside, only the first of several processes prints."""
-    if launched().first:
-        yield
-        return
-    with (
-        open(os.devnull, "w") as nowhere,
-        contextlib.redirect_stdout(nowhere),
-        contextlib.redirect_stderr(nowhere),
-    ):
+    with contextlib.ExitStack() as stack:
+        if not launched().first:
+            nowhere = stack.enter_context(open(os.devnull, "w"))
+            stack.enter_context(contextlib.redirect_stdout(nowhere))
+            stack.enter_context(contextlib.redirect_stderr(nowhere))
         yield

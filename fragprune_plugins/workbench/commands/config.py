@@ -29,22 +29,16 @@ def _read_config(ctx: click.Context, param: click.Parameter, value: Path | None)
             values = tomllib.loads(reading.text())
     except UsageError as error:
         raise click.BadParameter(str(error), ctx, param) from error
-    options = {
-        word.lstrip("-"): each
-        for each in ctx.command.params
-        if isinstance(each, click.Option) and each is not param
-        for word in each.opts
-        if word.startswith("--")
-    }
+    options = [each for each in ctx.command.params if isinstance(each, click.Option)]
     names: dict[str, Any] = {}
     for key, setting in values.items():
-        word = key.replace("_", "-")
-        if word not in options:
-            raise click.BadParameter(
-                f"{value}: {key!r} is no option of {ctx.command_path}.", ctx, param
-            )
+        word = f"--{key.replace('_', '-')}"
+        option = next((each for each in options if word in each.opts and each is not param), None)
+        if option is None:
+            said = f"{value}: {key!r} is no option of {ctx.command_path}."
+            raise click.BadParameter(said, ctx, param)
         try:
-            names[str(options[word].name)] = _as_words(options[word], setting)
+            names[str(option.name)] = _as_words(option, setting)
         except ValueError as error:
             raise click.BadParameter(f"{value}: {key}: {error}", ctx, param) from error
     ctx.default_map = {**(ctx.default_map or {}), **names}

@@ -8,51 +8,34 @@ from typing import Any, get_args
 import click
 
 from fragprune_plugins.errors import UsageError
+from fragprune_plugins.learning import pressure, schedule
 from fragprune_plugins.learning.goals import Control, Fewer, Goal, Portable, Pressure
-from fragprune_plugins.learning.pressure import (
-    ELASTICITY,
-    LEAST_PRESSURE,
-    MOST_PRESSURE,
-    PORTABLE_ELASTICITY,
-)
-from fragprune_plugins.learning.schedule import (
-    FINETUNE_ITERATIONS,
-    QUICK_ITERATIONS,
-    USUAL_STOP,
-    Settings,
-    steps_of,
-)
+from fragprune_plugins.learning.schedule import Settings, steps_of
 from fragprune_plugins.types import Rim
 from fragprune_plugins.workbench.commands.options import Function, Number, bundled
 from fragprune_plugins.workbench.commands.rules import Alone, apart
 from fragprune_plugins.workbench.goals import AtMost, Faster
 
 
-class _Stop(click.ParamType):  # type: ignore[type-arg] # generic in later releases alone
-    """Type of an option for a stop: a share of light, auto, or off, which is None."""
-
-    name = "share"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> float | str | None:
-        """The option's value; a usage error if it is none of the three."""
-        words = {"auto": "auto", "off": None}
-        return words[value] if value in words else click.FLOAT.convert(value, param, ctx)
+def _stop(value: str) -> float | str | None:
+    """A stop as an option gives it: a share of light, auto, or off, which is None."""
+    words = {"auto": "auto", "off": None}
+    return words[value] if value in words else click.FLOAT(value)
 
 
 _OPTIONS = (
     click.option(
-        "--iters", type=int, help=f"Iterations of stage 2; default {FINETUNE_ITERATIONS}."
+        "--iters", type=int, help=f"Iterations of stage 2; default {schedule.FINETUNE_ITERATIONS}."
     ),
     click.option(
-        "--quick", is_flag=True, help=f"Run {QUICK_ITERATIONS} iterations, for most of the gain."
+        "--quick",
+        is_flag=True,
+        help=f"Run {schedule.QUICK_ITERATIONS} iterations, for most of the gain.",
     ),
     click.option(
         "--train",
         type=click.Choice(["opacity", "appearance", "all"]),
         default="all",
-        show_default=True,
         help="Parameters that learn with the cutoffs: opacities alone, as in the paper; "
         "appearance adds SH; all adds shapes and positions, and truncates in the last 2,000 "
         "iterations only.",
@@ -61,8 +44,9 @@ _OPTIONS = (
         "--pressure",
         type=float,
         help="Weight of drawn fragments per pixel in the loss; default: "
-        f"{2 * ELASTICITY:g} of the loss per fragment ({ELASTICITY:g} unless all parameters "
-        f"learn in stage 2), from {LEAST_PRESSURE:g} to {MOST_PRESSURE:g}.",
+        f"{2 * pressure.ELASTICITY:g} of the loss per fragment ({pressure.ELASTICITY:g} unless all "
+        "parameters learn in stage 2), from "
+        f"{pressure.LEAST_PRESSURE:g} to {pressure.MOST_PRESSURE:g}.",
     ),
     click.option(
         "--target-speedup",
@@ -75,16 +59,15 @@ _OPTIONS = (
         is_flag=True,
         help="For viewers that ignore cutoffs: learn none, and press on the area that the "
         "Gaussians cover instead of on drawn fragments. --pressure is its weight then; default: "
-        f"{PORTABLE_ELASTICITY:g} of the loss per pixel of area.",
+        f"{pressure.PORTABLE_ELASTICITY:g} of the loss per pixel of area.",
     ),
     click.option(
         "--stop",
-        type=_Stop(),
+        type=_stop,
         metavar="SHARE|auto|off",
         default="auto",
-        show_default=True,
         help="A pixel draws the fragment that leaves less than this share of its light, and ends "
-        f"there. auto: the model's own; else {USUAL_STOP:g} where cutoffs learn from "
+        f"there. auto: the model's own; else {schedule.USUAL_STOP:g} where cutoffs learn from "
         "photographs. off: add none. A number also works with --control.",
     ),
     click.option(
@@ -142,10 +125,8 @@ _OF_FINETUNE = (
 
 
 def learning_options(*, every_goal: bool) -> Callable[[Function], Function]:
-    """The options of learning, which a command gets as ``settings``.
-
-    Its own ``seed``, ``itself`` and ``views_per_step``, if it has them, are part of these. With
-    ``every_goal`` goals are offered, too, that a host's training cannot meet.
+    """The options of learning, which a command gets as ``settings``, with its own ``seed``,
+    ``itself`` and ``views_per_step``. A host's training cannot meet every goal.
     """
     options = _OPTIONS + _OF_FINETUNE if every_goal else _OPTIONS
     return bundled(lambda given: {"settings": _settings(given)}, *options)
@@ -154,10 +135,10 @@ def learning_options(*, every_goal: bool) -> Callable[[Function], Function]:
 def _settings(given: dict[str, Any]) -> Settings:
     itself, views = given.get("itself", False), given.pop("views_per_step", 1)
     iters, quick = given.pop("iters"), given.pop("quick")
-    default = QUICK_ITERATIONS if quick or itself else FINETUNE_ITERATIONS
+    short = schedule.QUICK_ITERATIONS if quick or itself else schedule.FINETUNE_ITERATIONS
     try:
         return Settings(
-            iterations=steps_of(default, views) if iters is None else iters,
+            iterations=steps_of(short, views) if iters is None else iters,
             goal=_goal(given),
             itself=itself,
             seed=given.get("seed", 0),
@@ -183,7 +164,7 @@ _SPELLED = {
 
 def _goal(given: dict[str, Any]) -> Goal:
     """The one goal that options name; ``LEARNING_APART`` sees to it that they name no two."""
-    pressure, portable, control = map(given.pop, ("pressure", "portable", "control"))
+    weight, portable, control = map(given.pop, ("pressure", "portable", "control"))
     kinds: dict[str, Any] = {"target_speedup": Fewer, "target_time": Faster, "max_drop": AtMost}
     numbers = {name: given.pop(name, None) for name in kinds}
     goals: list[Goal] = [kinds[k](number) for k, number in numbers.items() if number is not None]
@@ -191,4 +172,4 @@ def _goal(given: dict[str, Any]) -> Goal:
         return goals[0]
     if control:
         return Control()
-    return Portable(pressure) if portable else Pressure(pressure)
+    return Portable(weight) if portable else Pressure(weight)

@@ -26,8 +26,7 @@ from fragprune_plugins.plugins.points import blaming, load, offered
 from fragprune_plugins.workbench.commands.options import Function
 from fragprune_plugins.workbench.ranks import launched
 
-GROUP = "fragprune.logs"
-"""The entry-point group of kinds of logs."""
+GROUP = "fragprune.logs"  # the entry-point group of kinds of logs
 
 
 COLUMNS = tuple(each.name for each in fields(StepStats))
@@ -46,10 +45,8 @@ class Log(Protocol):
 class CsvLog:
     """A row a step. Rows of earlier steps stay: a fine-tuning that was killed goes on after them.
 
-    All others are another run's, or what the kill has lost, and go.
-
-    Raises:
-        OutputError: it cannot be written, or holds something else than a log.
+    All others are another run's, or what the kill has lost, and go. A file that cannot be written,
+    or that is no log, is an OutputError.
     """
 
     def __init__(self, path: str) -> None:
@@ -97,11 +94,7 @@ class CsvLog:
 
 
 class TensorBoardLog:
-    """Scalars under ``fragprune/`` in an event file.
-
-    Raises:
-        UsageError: TensorBoard is not installed.
-    """
+    """Scalars under ``fragprune/`` in an event file; UsageError if TensorBoard is not installed."""
 
     def __init__(self, folder: str) -> None:
         try:
@@ -121,11 +114,7 @@ class TensorBoardLog:
 
 
 class WandbLog:
-    """A run of Weights & Biases. It uses the network, unless WANDB_MODE=offline.
-
-    Raises:
-        UsageError: wandb is not installed.
-    """
+    """A run of Weights & Biases; the network, unless WANDB_MODE=offline. UsageError without it."""
 
     def __init__(self, project: str) -> None:
         try:
@@ -144,11 +133,7 @@ class WandbLog:
 
 
 class Bar:
-    """A bar on stderr below the host's own, if stderr is a terminal.
-
-    Args:
-        warmup: so many of them come before thresholds open.
-    """
+    """A bar on stderr below the host's own, if that is a terminal; ``warmup`` steps come first."""
 
     def __init__(self, total: int, warmup: int) -> None:
         self._total, self._warmup = total, warmup
@@ -160,9 +145,8 @@ class Bar:
             self._bar = tqdm(total=self._total, disable=None, unit="it", position=1)
         name = "warm-up" if stats.step <= self._warmup else "fine-tuning"
         self._bar.set_description(f"fragprune, {name}", refresh=False)
-        self._bar.set_postfix(
-            fragments=f"{stats.fragments_per_pixel:.1f}/px", loss=f"{stats.loss:.4f}", refresh=False
-        )
+        drawn, loss = f"{stats.fragments_per_pixel:.1f}/px", f"{stats.loss:.4f}"
+        self._bar.set_postfix(fragments=drawn, loss=loss, refresh=False)
         self._bar.update()
 
     def close(self) -> None:

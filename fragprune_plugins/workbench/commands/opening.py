@@ -17,20 +17,11 @@ from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.plugins.hooks import engine_for
 from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
-from fragprune_plugins.workbench.figures import records
-from fragprune_plugins.workbench.figures.wording import ITSELF
+from fragprune_plugins.workbench.figures import records, wording
 from fragprune_plugins.workbench.ranks import launched, local_rank
+from fragprune_plugins.workbench.scenes import generated, output
 from fragprune_plugins.workbench.scenes.cameras import load_cameras, load_scene_cameras, sized
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
-from fragprune_plugins.workbench.scenes.generated import around, own_pictures
-from fragprune_plugins.workbench.scenes.output import (
-    ARGUMENTS,
-    cameras_of,
-    output_folder,
-    over_white,
-    trained_on,
-    trained_size,
-)
 
 
 def bound_threads(threads: int | None) -> None:
@@ -40,12 +31,7 @@ def bound_threads(threads: int | None) -> None:
 
 
 def open_engine(options: EngineOptions) -> tuple[Engine, torch.device]:
-    """The engine of the options, its threads bounded, and the device for models and views.
-
-    Raises:
-        UsageError: the device does not exist.
-        EngineError: the engine does not exist or cannot run here.
-    """
+    """The engine of the options, its threads bounded, and the device for models and views."""
     bound_threads(options.threads)
     device = device_for(options.device, options.name)
     if launched().several and options.device in ("auto", "cuda") and device.type == "cuda":
@@ -58,18 +44,13 @@ def photographs_for(
 ) -> Photographs:
     """The photographs that the options name; without --data those that the model was trained on.
 
-    Options that were given override what the training says. Beside --data it still says whether
-    the model was drawn over white, and around the middle.
-
-    Raises:
-        UsageError: there is no folder, and the model lies in no output folder with arguments.
-        DatasetError: the training's arguments cannot be read.
+    Options that were given override what the training says. Without either it is a UsageError.
     """
     if scene.data is not None:
         return drawn_as_trained(scene, model)
-    trained = trained_on(model)
+    trained = output.trained_on(model)
     if trained is None:
-        found = f"no folder, and no {ARGUMENTS} of a training around {model}"
+        found = f"no folder, and no {output.ARGUMENTS} of a training around {model}"
         raise UsageError("--data", found, "photographs", remedy)
     said = f"Photographs: {trained.folder}, which the model was trained on"
     click.echo(printable(said), err=True)
@@ -77,12 +58,9 @@ def photographs_for(
 
 
 def drawn_as_trained(scene: SceneOptions, *models: Path) -> Photographs:
-    """The photographs in --data, over the background and around the point of models' trainings.
-
-    The arguments in their output folders tell, and better than these the records beside them.
-    """
+    """The photographs in --data, over the background and around the point of models' trainings."""
     known = [Photographs(Path())]
-    for told in (trained_on, _recorded):
+    for told in (output.trained_on, _recorded):  # the latter tells better
         for model in models:
             with contextlib.suppress(DatasetError, RecordError):
                 known.append(told(model) or known[-1])
@@ -95,34 +73,29 @@ def _recorded(model: Path) -> Photographs | None:
         return None
     if read := records.recorded(record):
         return read.photographs
-    return trained_on(records.located(str(record.data.get("model")), record.path.parent))
+    return output.trained_on(records.located(str(record.data.get("model")), record.path.parent))
 
 
 def as_trained(model: Path) -> tuple[bool, Mapping[str, Any]]:
-    """The ``filtered`` and the ``drawing`` of a model, by the record of the run that trained it.
-
-    A model that is newer than a record elsewhere in its folder is of another training.
-    """
-    written, folder = model.stat().st_mtime_ns, output_folder(model)
+    """The ``filtered`` and the ``drawing`` of a model, by the record of the run that trained it."""
+    written, folder = model.stat().st_mtime_ns, output.output_folder(model)
     with contextlib.suppress(RecordError):
         found = records.find(folder) if folder else [records.beside(model)]
         for record in filter(None, reversed(found)):
             read, path = records.recorded(record), record.path
             own = read and model.resolve() in [each.resolve() for each in read.models]
             current = path.parent.samefile(model.parent) or path.stat().st_mtime_ns >= written
-            if read and own and current:
+            if read and own and current:  # else it is of another training
                 return read.filtered, read.drawing
     return False, {}
 
 
 def warn_if_antialiased(*models: Path) -> None:
     """Warn of models that their runs drew with antialiasing, in a command that draws without."""
+    said = "%s was trained with antialiasing, and is drawn here as 3DGS draws, without"
     for model in models:
         if as_trained(model)[1].get("compensation", "none") != "none":
-            log.warning(
-                "%s was trained with antialiasing, and is drawn here as 3DGS draws, without",
-                printable(str(model)),
-            )
+            log.warning(said, printable(str(model)))
 
 
 def overridden(photographs: Photographs, scene: SceneOptions) -> Photographs:
@@ -151,11 +124,7 @@ class OwnCameras:
     seed: int = 0  # of what is generated
 
     def pictures(self, model: Model, engine: Engine) -> Dataset:
-        """A model's own pictures from these cameras.
-
-        Raises:
-            DatasetError: the cameras cannot be read.
-        """
+        """A model's own pictures from these cameras; DatasetError if these cannot be read."""
         scene, seed, held_out = self.scene, self.seed, None
         if scene.data is not None:
             views, test = load_scene_cameras(scene.data, white_background=scene.white_background)
@@ -164,23 +133,19 @@ class OwnCameras:
             views = load_cameras(self.cameras, white_background=scene.white_background)
         else:
             background = torch.full((3,), float(scene.white_background))
-            views = around(model, background=background, seed=seed)
+            views = generated.around(model, background=background, seed=seed)
         views = sized(views, scene.resolution)
-        return own_pictures(model, views, held_out, engine=engine, seed=seed)
+        return generated.own_pictures(model, views, held_out, engine=engine, seed=seed)
 
 
 def own_cameras_for(
     model: Path, scene: SceneOptions, cameras: Path | None, seed: int = 0, *, orbit: bool = False
 ) -> OwnCameras:
-    """The cameras that the options name; without any those of the model's training, if it is known.
-
-    As its training did, it is drawn over white, and they have the size that they had there.
-
-    Args:
-        orbit: all around it, whatever is known.
+    """The cameras that the options name; without any those of the model's training, if it is known,
+    at their size there. With ``orbit`` they are all around it. It is drawn over its background.
     """
     named = orbit or scene.data is not None or cameras is not None
-    if not named and (cameras := cameras_of(model)):
+    if not named and (cameras := output.cameras_of(model)):
         click.echo(printable(f"Cameras: {cameras}, of its training"), err=True)
         scene = at_its_size(model, scene)
     return OwnCameras(over_its_background(model, scene), cameras, seed)
@@ -188,45 +153,34 @@ def own_cameras_for(
 
 def at_its_size(model: Path, scene: SceneOptions) -> SceneOptions:
     """The options, without ``--resolution`` at the size that a model's training had."""
-    given = "resolution" in scene.given
-    return scene if given else replace(scene, resolution=trained_size(model))
+    told = None if "resolution" in scene.given else output.arguments(model)
+    return replace(scene, resolution=told.resolution) if told else scene
 
 
 def over_its_background(model: Path, scene: SceneOptions) -> SceneOptions:
     """The options, over white also where a model's training or its record says that it was."""
-    white = scene.white_background or over_white(model)
+    known: list[Any] = [scene, output.arguments(model)]
     with contextlib.suppress(RecordError):
-        if not white and (record := records.beside(model)):
+        if record := records.beside(model):
             own, read = own_cameras(record), records.recorded(record)
-            white = bool(own and own.scene.white_background)
-            white |= bool(read and read.photographs.white_background)
+            known += [own and own.scene, read and read.photographs]
+    white = any(each.white_background for each in known if each)
     return replace(scene, white_background=white)
 
 
 def own_cameras(record: records.Record, scene: SceneOptions | None = None) -> OwnCameras | None:
-    """The cameras of a fine-tuning with --self; None for another record.
-
-    Args:
-        scene: options that were given, which override what the record says.
-
-    Raises:
-        RecordError: the record is malformed.
-    """
-    if record.data.get("target") != ITSELF:
+    """The cameras of a fine-tuning with --self, with options in their place; else None."""
+    if record.data.get("target") != wording.ITSELF:
         return None
     scene = scene or SceneOptions()
     with records.RECORD_FILE.stated(record.path) as reading:
         reading.place = "data.cameras"
         values = record.data.get("cameras") or {}
-        folder = record.path.parent
-        data, cameras = (
-            records.located(values[name], folder) if values.get(name) else None
-            for name in ("data", "file")
-        )
-        if "resolution" not in scene.given:
-            size = values.get("resolution", 1)  # a divisor in records of earlier versions
-            size = Resolution(**size) if isinstance(size, dict) else Resolution(int(size))
-            scene = replace(scene, resolution=size)
+        paths = (values.get(name) for name in ("data", "file"))
+        data, cameras = (each and records.located(each, record.path.parent) for each in paths)
+        size = values.get("resolution", 1)  # a divisor in records of earlier versions
+        size = Resolution(**size) if isinstance(size, dict) else Resolution(int(size))
+        size = scene.resolution if "resolution" in scene.given else size
         white = scene.white_background or bool(values.get("white_background"))
-        scene = replace(scene, data=data, white_background=white)
-        return OwnCameras(scene, cameras, int(record.data["seed"]))
+        scene = replace(scene, data=data or None, resolution=size, white_background=white)
+        return OwnCameras(scene, cameras or None, int(record.data["seed"]))

@@ -21,7 +21,6 @@ from fragprune_plugins.workbench.ranks import launched
 from fragprune_plugins.workbench.scenes.output import newest_model
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-
 FILE = click.Path(path_type=Path)
 
 
@@ -81,10 +80,7 @@ class ModelFile(click.Path):
 
 
 MODEL = ModelFile()
-
-
-Option = Callable[[Any], Any]
-"""What ``click.option`` gives."""
+Option = Callable[[Any], Any]  # what ``click.option`` gives
 
 
 def bundled(
@@ -121,22 +117,12 @@ def engine_options(
 ) -> Callable[[Function], Function]:
     """The options of ``EngineOptions``, which a command gets as ``engine``."""
     names = "auto (the fastest that runs here), reference, cpu, cuda, or a plugin's engine."
-
-    def gather(given: dict[str, Any]) -> dict[str, Any]:
-        return {"engine": EngineOptions(*map(given.pop, ("engine", "device", "threads")))}
-
+    given = ("engine", "device", "threads")
     return bundled(
-        gather,
+        lambda options: {"engine": EngineOptions(*map(options.pop, given))},
+        click.option("--engine", metavar="NAME", default="auto", help=f"{what}: {names}"),
         click.option(
-            "--engine", metavar="NAME", default="auto", show_default=True, help=f"{what}: {names}"
-        ),
-        click.option(
-            "--device",
-            metavar="auto|cpu|cuda[:N]",
-            callback=_device,
-            default=default,
-            show_default=True,
-            help=device,
+            "--device", metavar="auto|cpu|cuda[:N]", callback=_device, default=default, help=device
         ),
         click.option(
             "--threads",
@@ -164,7 +150,6 @@ CAMERAS_HELP = (
 )
 
 CAMERAS_APART = Alone(("--cameras", "--data", "--orbit", "--inside"), "one source of cameras")
-
 TRAINED_ON = "Default: the photographs that MODEL was trained on, by the cfg_args of its host."
 
 
@@ -181,8 +166,8 @@ class SceneOptions:
     def as_record(self, cameras: Path | None) -> dict[str, Any]:
         """The cameras of a model's own pictures as plain values, for records."""
         return {
-            "data": None if self.data is None else str(self.data.resolve()),
-            "file": None if cameras is None else str(cameras.resolve()),
+            "data": self.data and str(self.data.resolve()),
+            "file": cameras and str(cameras.resolve()),
             "resolution": asdict(self.resolution),
             "white_background": self.white_background,
         }
@@ -195,9 +180,8 @@ def scene_options(data: str = f"{DATA_HELP} {TRAINED_ON}") -> Callable[[Function
     def gather(given: dict[str, Any]) -> dict[str, Any]:
         source = click.get_current_context().get_parameter_source
         chosen = frozenset(name for name in names if source(name) is not ParameterSource.DEFAULT)
-        data, images, divide, white_background = map(given.pop, names)
-        size = Resolution(divide)
-        return {"scene": SceneOptions(data, images, size, white_background, chosen)}
+        data, images, divide, white = map(given.pop, names)
+        return {"scene": SceneOptions(data, images, Resolution(divide), white, chosen)}
 
     return bundled(
         gather,
@@ -206,7 +190,6 @@ def scene_options(data: str = f"{DATA_HELP} {TRAINED_ON}") -> Callable[[Function
             "--images",
             metavar="NAME",
             default="images",
-            show_default=True,
             help="Folder of --data with the images, such as images_4. Without images/, the "
             "largest of images_2, images_4 and images_8 serves.",
         ),
@@ -214,7 +197,6 @@ def scene_options(data: str = f"{DATA_HELP} {TRAINED_ON}") -> Callable[[Function
             "--resolution",
             type=click.IntRange(1, 16),
             default=1,
-            show_default=True,
             help="Divide the images' sides by this.",
         ),
         click.option(
@@ -243,13 +225,9 @@ own_picture_options = bundled(
     click.option("--cameras", type=FILE, help="Likewise, from a cameras.json or transforms*.json."),
     click.option("--orbit", is_flag=True, help="Likewise, from cameras all around the model."),
 )
-"""For what is compared with a model's own pictures.
-
-A command gets ``itself``, whether one of them was given, ``orbit``, and ``cameras``, of a file or
-None.
-``CAMERAS_APART`` are its rules.
+"""For what is compared with a model's own pictures. A command gets ``itself``, whether one of them
+was given, ``orbit``, and ``cameras``, a file or None. ``CAMERAS_APART`` are its rules.
 """
-
 
 truncation_option = click.option(
     "--no-truncation", is_flag=True, help="Ignore the cutoffs stored with the model."
@@ -259,7 +237,6 @@ views_option = click.option(
     "--views",
     type=click.Choice(["test", "train", "all"]),
     default="test",
-    show_default=True,
     help="Views to use; test means the held-out views (COLMAP: every 8th).",
 )
 
