@@ -24,7 +24,6 @@ from fragprune_plugins.workbench.commands.command import Command, Report, work_o
     "--enlarge",
     type=click.IntRange(1, 16),
     default=1,
-    show_default=True,
     help="Time frames this many times as wide and high as the photographs. All other figures are "
     "still those at the photographs' size.",
 )

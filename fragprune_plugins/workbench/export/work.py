@@ -34,23 +34,28 @@ def export(
     for given in filter(None, (model, pruned)):
         require_place(out, given, thresholds=stop is not None or pruned is not None)
     splat = load(model, truncation=not no_truncation)
-    splat = splat if pruned is None else _restored(splat, model, pruned)
-    splat = splat if stop is None else splat.with_rules(stop=stop)
+    if pruned is not None:
+        splat = _restored(splat, model, pruned)
+    if stop is not None:
+        splat = splat.with_rules(stop=stop)
     if splat.pruned:
         formats.expect_carrier(form, out)
     dropped, lines, count = None, [], len(splat)
     if keep == "visible":
         splat = splat.keep(visible(splat))
-        dropped = {"gaussians": count - len(splat), "of": count}
-        lines.append(
-            f"Dropped {count - len(splat):,} of {count:,} Gaussians, too faint for any view."
-        )
+        gone = count - len(splat)
+        dropped = {"gaussians": gone, "of": count}
+        lines.append(f"Dropped {gone:,} of {count:,} Gaussians, too faint for any view.")
     save(out, splat)
     truncated = splat.falloff is not None
     column = THRESHOLD_COLUMN if form.paired and truncated else None
     lines.append(describe_written(out, _held(splat, column), pruned=splat.pruned))
-    kept = _kept(splat, out) if form.keeps else None
-    lines += [] if kept is None else [_said(kept)]
+    kept = None
+    if form.keeps:
+        view = overview(splat, width=480, height=360)  # from outside
+        with torch.no_grad():
+            kept = psnr(*(rasterize(each, view).image for each in (load(out), splat)))
+        lines.append(_said(kept))
     data = {
         "model": str(model),
         "out": str(out),
@@ -75,50 +80,35 @@ def _held(splat: Model, column: str | None) -> str:
     return f": {len(splat)} Gaussian{'' if len(splat) == 1 else 's'} with {held}"
 
 
-def _kept(splat: Model, out: Path) -> float:
-    """PSNR, dB, of what a file shows from outside against what the model does."""
-    view = overview(splat, width=480, height=360)
-    with torch.no_grad():
-        shown, whole = (rasterize(each, view).image for each in (load(out), splat))
-    return psnr(shown, whole)
-
-
 def _said(kept: float) -> str:
     """A sentence on the picture that a format keeps."""
     found = "equal to" if kept == torch.inf else f"at {kept:.1f} dB PSNR against"
-    warning = (
-        f" Warning: below {VISIBLE:g} dB the change can be seen. Choose another format; a Gaussian "
-        "far from all others, or a scene of very small or large units, takes its bits."
-    )
     said = f"From outside, the file's picture is {found} the model's."
-    return said + (warning if kept < VISIBLE else "")
+    if kept >= VISIBLE:
+        return said
+    return (
+        f"{said} Warning: below {VISIBLE:g} dB the change can be seen. Choose another format; a "
+        "Gaussian far from all others, or a scene of very small or large units, takes its bits."
+    )
 
 
 def _restored(edited: Model, path: Path, source: Path) -> Model:
-    """A model with the cutoffs and rules of another, in which its Gaussians are found again.
-
-    Opacity and first colour tell which: editors that reorder, remove, move, turn and enlarge
-    Gaussians keep both to the bit. Of Gaussians that look alike the smallest cutoff serves.
-
-    Raises:
-        ModelFileError: ``source`` has no cutoffs.
-        AlignmentError: a Gaussian of ``edited`` is not in ``source``.
-    """
+    """A model with the cutoffs and rules of another, in which its Gaussians are found again."""
+    # By opacity and first colour: editors that reorder, remove, move, turn and enlarge Gaussians
+    # keep both to the bit. Of Gaussians that look alike the smallest cutoff serves.
     pruned = load(source)
     if pruned.falloff is None:
-        raise ModelFileError(
-            str(source), "a model without cutoffs", "a pruned model", "Name the pruned one."
-        )
+        found, remedy = "a model without cutoffs", "Name the pruned one."
+        raise ModelFileError(str(source), found, "a pruned model", remedy)
     looks = [torch.cat([each.opacity, each.f_dc[:, 0]], dim=1) for each in (pruned, edited)]
     kinds, of = torch.unique(torch.cat(looks), dim=0, return_inverse=True)
     theirs, ours = of.split([len(pruned), len(edited)])
     least = torch.full((len(kinds),), torch.inf)
-    found = least.scatter_reduce(0, theirs, pruned.falloff, "amin")[ours]
-    if strange := int(found.isinf().sum()):
-        raise AlignmentError(
-            str(path),
-            f"{strange:,} of {len(edited):,} Gaussians that {source} lacks",
-            "opacities and colours as they are there, to the bit",
-            "Leave colours alone and save a .ply, or prune the edited model: fragprune finetune.",
-        )
-    return replace(edited, thresholds=ThresholdStore.from_falloff(found).ruled(**pruned.rules))
+    again = least.scatter_reduce(0, theirs, pruned.falloff, "amin")[ours]
+    if strange := int(again.isinf().sum()):
+        found = f"{strange:,} of {len(edited):,} Gaussians that {source} lacks"
+        expected = "opacities and colours as they are there, to the bit"
+        alone = "Leave colours alone and save a .ply"
+        remedy = f"{alone}, or prune the edited model: fragprune finetune."
+        raise AlignmentError(str(path), found, expected, remedy)
+    return replace(edited, thresholds=ThresholdStore.from_falloff(again).ruled(**pruned.rules))

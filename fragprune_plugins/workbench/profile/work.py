@@ -7,13 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from fragprune_plugins.workbench.commands import opening
-from fragprune_plugins.workbench.commands.command import Report
-from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
-from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
-from fragprune_plugins.workbench.figures.matching import hardly_shown, told_or_matched
-from fragprune_plugins.workbench.figures.pictures import leave_panels
-from fragprune_plugins.workbench.figures.wording import describe, nothing_drawn, profiled
+from fragprune_plugins.workbench.commands import command, opening, options
+from fragprune_plugins.workbench.figures import evaluate, matching, pictures, wording
 from fragprune_plugins.workbench.models.model import load, writable_folder
 from fragprune_plugins.workbench.scenes.training import exposures_left_out
 
@@ -24,12 +19,12 @@ def profile(
     itself: bool,
     orbit: bool,
     cameras: Path | None,
-    scene: SceneOptions,
+    scene: options.SceneOptions,
     out: Path | None,
     views: str,
     no_truncation: bool,
-    engine: EngineOptions,
-) -> Report:
+    engine: options.EngineOptions,
+) -> command.Report:
     """Do what ``fragprune profile`` promises; its options are the arguments."""
     rasterizer, device = opening.open_engine(engine)
     if out is not None:
@@ -43,16 +38,18 @@ def profile(
     else:
         remedy = "Name the scene's folder with --data; without photographs, pass --self."
         read = opening.photographs_for(model, scene, remedy=remedy)
-        _, dataset = told_or_matched(loaded.untruncated(), read, rasterizer)
+        _, dataset = matching.told_or_matched(loaded.untruncated(), read, rasterizer)
     shots = opening.chosen(dataset, views)
-    columns = {"untruncated": Candidate(loaded.untruncated(), drawing)}
+    columns = {"untruncated": evaluate.Candidate(loaded.untruncated(), drawing)}
     if loaded.pruned:
-        columns["truncated"] = Candidate(loaded, drawing)
-    measurements = measure_all(list(columns.values()), shots, engine=rasterizer)
+        columns["truncated"] = evaluate.Candidate(loaded, drawing)
+    measurements = evaluate.measure_all(list(columns.values()), shots, engine=rasterizer)
     measured = dict(zip(columns, measurements, strict=True))
-    warnings = nothing_drawn([each["fragments_per_pixel"] for each in measurements])
-    warnings += hardly_shown({"MODEL": measurements[-1]["psnr"]}, shots)
-    warnings += [] if itself else exposures_left_out(model)
+    warnings = [
+        *wording.nothing_drawn([each["fragments_per_pixel"] for each in measurements]),
+        *matching.hardly_shown({"MODEL": measurements[-1]["psnr"]}, shots),
+        *([] if itself else exposures_left_out(model)),
+    ]
     report: dict[str, Any] = {
         "model": str(model),
         "truncated": loaded.falloff is not None,
@@ -60,7 +57,7 @@ def profile(
         "columns": measured,
         "warnings": warnings,
     }
-    lines = [describe(profiled(report)), *(f"Warning: {each}" for each in warnings)]
+    lines = [wording.describe(wording.profiled(report)), *(f"Warning: {each}" for each in warnings)]
     if loaded.falloff is not None:
         quantiles = np.quantile(loaded.falloff.cpu(), [0.05, 0.25, 0.5, 0.75, 0.95]).tolist()
         report["threshold_quantiles"] = quantiles
@@ -69,6 +66,6 @@ def profile(
             + ", ".join(f"{value:.3f}" for value in quantiles)
         )
     if out is not None:
-        named = dict(zip(profiled(report), columns.values(), strict=True))
-        lines.append(leave_panels(out, "profile", report, named, shots, rasterizer))
-    return Report(report, "\n".join(lines))
+        named = dict(zip(wording.profiled(report), columns.values(), strict=True))
+        lines.append(pictures.leave_panels(out, "profile", report, named, shots, rasterizer))
+    return command.Report(report, "\n".join(lines))
