@@ -245,7 +245,7 @@ def test_the_hosts_own_json_flag_is_not_ours():
 def test_what_the_machine_refuses_is_stated_and_bugs_keep_their_traceback(
     data, path, monkeypatch, error, code
 ):
-    measuring = "fragprune_plugins.workbench.profile.work.measure_all"
+    measuring = "fragprune_plugins.workbench.figures.evaluate.measure_all"
     monkeypatch.setattr(measuring, Mock(side_effect=error))
     if code:
         refused(("profile", path, "--data", data), code, "")

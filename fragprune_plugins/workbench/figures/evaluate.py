@@ -28,11 +28,8 @@ from fragprune_plugins.workbench.ranks import launched
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 
 REPEATS = 9
-
 _COUNTED = ("fragments_per_pixel", "evaluated_per_pixel", "entries_per_pixel")
-
-SILENT = 2.0
-"""Seconds of measuring before a bar shows how far it is."""
+SILENT = 2.0  # seconds of measuring before a bar shows how far it is
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,10 +127,8 @@ def measure_all(
 ) -> list[dict[str, Any]]:
     """Measure models, all on one device, against the same pictures: the figures of ``measure``.
 
-    Frames of all are timed in turns, so that a busy machine slows them alike.
-
-    Args:
-        enlarge: timed frames are this many times as wide and high as the pictures.
+    Frames of all are timed in turns, so that a busy machine slows them alike; they are ``enlarge``
+    times as wide and high as the pictures.
     """
     device = candidates[0].model.device
     engine = engine_for(engine, device)
@@ -199,10 +194,9 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 @torch.no_grad()
 def covered_per_pixel(engine: Engine, inputs: RasterInputs) -> float:
-    """Pixels in the Gaussians' ellipses of sqrt(8) standard deviations, per pixel of the picture.
+    """Pixels in the Gaussians' ellipses of sqrt(8) standard deviations, per pixel; counted.
 
-    It is what viewers pay that ignore thresholds and do not ask how faint a Gaussian is. They
-    draw quads, whose area is 4 / pi times as large. The pixels are counted, not estimated.
+    Viewers that ignore thresholds and faintness draw quads, whose area is 4 / pi times as large.
     """
     assert isinstance(inputs.splats, Splats)
     squared = torch.full_like(inputs.splats.opacities, SQUARED_RADIUS)
@@ -220,13 +214,12 @@ def frame_times(
     """Time frames of splats in turns: frame_ms and frame_ms_se of each, as those of ``measure``."""
     turns = rounds(candidates, views, engine)
     times = [next(turns) for _ in bar(range(repeats), "timing frames")]
-    return [
-        {
-            "frame_ms": statistics.median(ms for frames in repeated for ms in frames),
-            "frame_ms_se": standard_error([statistics.median(frames) for frames in repeated]),
-        }
-        for repeated in zip(*times, strict=True)
-    ]
+    found = []
+    for repeated in zip(*times, strict=True):
+        error = standard_error([statistics.median(frames) for frames in repeated])
+        middle = statistics.median(ms for frames in repeated for ms in frames)
+        found.append({"frame_ms": middle, "frame_ms_se": error})
+    return found
 
 
 def rounds(

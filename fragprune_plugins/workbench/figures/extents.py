@@ -26,9 +26,7 @@ class Extent:
     def squared(self, opacities: Tensor) -> Tensor:
         """(N,) squared radii of Gaussians of these opacities; negative where nothing is drawn."""
         most = torch.full_like(opacities, self.sigmas**2)
-        if not self.alpha:
-            return most
-        return torch.minimum(most, 2 * (opacities / self.alpha).log())
+        return most.minimum(2 * (opacities / self.alpha).log()) if self.alpha else most
 
     def thresholds(self, opacities: Tensor) -> Tensor:
         """(N,) falloff at the rim; 1 where nothing is drawn."""
@@ -79,10 +77,7 @@ set. Babylon.js ``gaussianSplatting.fx``: as antimatter15. PlayCanvas 2.22 ``gsp
 def covered(engine: Engine, inputs: RasterInputs, squared: Tensor) -> RasterOutputs:
     """Draw so that fragments count all pixels in the Gaussians' ellipses, hidden ones too.
 
-    Engines look no farther than 3.33 standard deviations.
-
-    Args:
-        squared: (N,) squared radii of the ellipses; negative for none.
+    Their radii have squares (N,), negative for none; engines look no farther than 3.33 sigma.
     """
     # Alpha capped at its least hides nothing; see ``visible``. A threshold then ends each ellipse.
     assert isinstance(inputs.splats, Splats)
@@ -98,11 +93,7 @@ def quads(engine: Engine, inputs: RasterInputs, squared: Tensor) -> float:
 
 
 def shaded(engine: Engine, inputs: RasterInputs, viewer: Viewer) -> float:
-    """Pixels that a viewer is asked to shade, over the pixels of the picture.
-
-    For tiles it is the pixels of all (Gaussian, tile) pairs, those too that are spared where a tile
-    is opaque.
-    """
+    """Pixels that a viewer is asked to shade, over the picture's; of tiles also those spared."""
     assert isinstance(inputs.splats, Splats)
     squared = viewer.extent.squared(inputs.splats.opacities)
     if viewer.shape == "quad":

@@ -20,20 +20,15 @@ from fragprune_plugins.workbench.scenes.dataset import OFF_CENTRE, Dataset, Shot
 
 OTHER_SCENE = 3.0
 """dB of PSNR that a model has to be above pictures of one colour each, to be one of the scene.
-
-On two scenes trained models are by ten or more; on an object's photographs one that was moved is
-at -6 to 3, or up to 10 if it was moved a little.
-"""
+Trained models of two scenes are by ten or more; one of an object that was moved is at -6 to 3."""
 
 _EQUAL = 100.0  # dB of PSNR: what is left is rounding
 
 
 def matched(model: Model, read: Photographs, engine: Engine) -> tuple[Photographs, Dataset]:
-    """Photographs around the middle or the scene's principal point, with or without their alpha.
-
-    3DGS and most of its descendants take the middle, whatever the scene says, and drop the alpha of
-    a COLMAP scene's images; others do not. The way in which the model shows its training
-    photographs best is taken.
+    """Photographs around the middle or the principal point, with or without alpha, as a model shows
+    them best: 3DGS and most of its descendants take the middle, whatever the scene says, and drop
+    the alpha of a COLMAP scene's images; others do not.
     """
     dataset = load_photographs(replace(read, centred=True))  # nothing is wrong with another point
     told = bool(read.centred), read.opaque
@@ -67,20 +62,15 @@ def shown(model: Model, dataset: Dataset, engine: Engine) -> float:
 
 
 def shown_and_plain(model: Model, dataset: Dataset, engine: Engine) -> tuple[float, float]:
-    """How well a model shows up to eight training pictures, and one colour each does, dB of PSNR.
-
-    They are medians: a picture may itself be of one colour, which shows it without any error.
-    """
+    """How well a model shows up to eight training pictures, and one colour each: median dB."""
     shots = evenly_spaced(dataset.train, 8)
     return statistics.median(psnrs(Candidate(model), shots, engine)[0]), _plain(shots)
 
 
 def _plain(shots: Sequence[Shot]) -> float:
     """How well one colour each shows pictures that have more, dB of PSNR, their median."""
-    figures = []
-    for shot in shots:
-        colour = shot.image.mean(dim=(1, 2), keepdim=True).expand_as(shot.image)
-        figures.append(psnr(shot.looked_at(colour), shot.image))
+    means = ((shot, shot.image.mean(dim=(1, 2), keepdim=True)) for shot in shots)
+    figures = [psnr(s.looked_at(colour.expand_as(s.image)), s.image) for s, colour in means]
     return statistics.median([each for each in figures if each < _EQUAL] or [-math.inf])
 
 

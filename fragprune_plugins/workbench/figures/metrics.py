@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,11 +16,8 @@ from torch import Tensor
 from fragprune_plugins.errors import InputError
 from fragprune_plugins.learning.losses import SIGMA, WINDOW
 
-WEIGHTS = "vgg16-397923af.pth"
-"""torchvision's file of VGG16's weights, in ``checkpoints`` of ``torch.hub.get_dir()``."""
-
-SMALLEST = 16
-"""Pixels of a side of which VGG16's four poolings leave one."""
+WEIGHTS = "vgg16-397923af.pth"  # of VGG16, in ``checkpoints`` of ``torch.hub.get_dir()``
+SMALLEST = 16  # pixels of a side of which VGG16's four poolings leave one
 
 
 def psnr(image: Tensor, target: Tensor) -> float:
@@ -45,28 +43,16 @@ def ssim(image: Tensor, target: Tensor) -> float:
 
     The hosts' parameters: Gaussian window of sigma 1.5 (11 pixels), population covariance, data
     range 1, mean over channels. Pixels within 5 of the border are left out; the hosts' zero-padded
-    version counts them.
-
-    Raises:
-        InputError: an image smaller than the window.
+    version counts them. An image smaller than the window is an InputError.
     """
     from skimage.metrics import structural_similarity
 
     expect_window(image)
-    first, second = (
-        x.detach().clamp(0, 1).permute(1, 2, 0).cpu().double().numpy() for x in (image, target)
-    )
-    return float(
-        structural_similarity(  # type: ignore[no-untyped-call]
-            first,
-            second,
-            channel_axis=-1,
-            data_range=1.0,
-            gaussian_weights=True,
-            sigma=SIGMA,
-            use_sample_covariance=False,
-        )
-    )
+    both = (each.detach().clamp(0, 1).permute(1, 2, 0) for each in (image, target))
+    pair = (each.cpu().double().numpy() for each in both)
+    how = {"gaussian_weights": True, "sigma": SIGMA, "use_sample_covariance": False}
+    similarity: Any = structural_similarity
+    return float(similarity(*pair, channel_axis=-1, data_range=1.0, **how))
 
 
 def lpips(image: Tensor, target: Tensor) -> float | None:
@@ -74,9 +60,8 @@ def lpips(image: Tensor, target: Tensor) -> float | None:
 
     By the package ``lpips`` (0.1.4), from images scaled to [-1, 1] as it was trained on. The hosts'
     own figures differ: 3DGS scales to [0, 1]. Nothing is downloaded: the weights of VGG16 must lie
-    in torch's cache (``WEIGHTS``), where the first use of the package puts them.
-
-    Images below 16x16 pixels have no features, and so no distance.
+    in torch's cache (``WEIGHTS``), where the first use of the package puts them. Images below 16x16
+    pixels have no features, and so no distance.
     """
     network = _network(image.device)
     if network is None or min(image.shape[-2:]) < SMALLEST:

@@ -20,9 +20,7 @@ from markupsafe import Markup
 from fragprune_plugins.workbench.figures.pictures import colour_stops
 
 TEMPLATES = Path(__file__).with_name("templates")
-
-Size = tuple[int, int]
-"""Width and height, pixels."""
+Size = tuple[int, int]  # width and height, pixels
 
 
 @dataclass(frozen=True)
@@ -45,9 +43,8 @@ def render(template: Path, *others: Path, **values: Any) -> str:
         lstrip_blocks=True,
     )
     environment.globals["colours"] = colour_stops
-    style, script = (
-        Markup((TEMPLATES / name).read_text(encoding="utf-8")) for name in ("page.css", "page.js")
-    )
+    files = (TEMPLATES / name for name in ("page.css", "page.js"))
+    style, script = (Markup(file.read_text(encoding="utf-8")) for file in files)
     frame = {"style": style, "script": script, "allowed": Markup(allowed(script))}
     return environment.get_template(template.name).render(frame | values)
 

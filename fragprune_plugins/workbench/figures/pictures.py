@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from itertools import accumulate, chain, count
 from pathlib import Path
@@ -45,7 +46,7 @@ def stems(names: Sequence[str]) -> list[str]:
     taken: set[str] = set()
     found = []
     for name in names:
-        plain = "".join(c if c.isalnum() or c in "._+-~() " else "_" for c in name)
+        plain = re.sub(r"[^\w.+~() -]", "_", name)
         stem = Path(plain).stem.lstrip(".").encode()[:_STEM].decode(errors="ignore") or "view"
         # Some file systems take upper for lower case.
         for each in chain([stem], (f"{stem}-{number}" for number in count(2))):
@@ -58,11 +59,7 @@ def stems(names: Sequence[str]) -> list[str]:
 
 
 def save_image(path: Path, image: Tensor) -> None:
-    """Write an image (3, H, W), clamped to [0, 1], as 8-bit PNG.
-
-    Raises:
-        OutputError: the file cannot be written. Every function here raises it.
-    """
+    """Write an image (3, H, W), clamped to [0, 1], as 8-bit PNG; OutputError if it cannot be."""
     _save(path, picture(image))
 
 
@@ -73,10 +70,7 @@ def picture(image: Tensor) -> PIL.Image.Image:
 
 
 def save_map(path: Path, values: Tensor, limit: float) -> None:
-    """Write values (H, W), 0 or more, as colours, without a scale: ``colour_stops`` has it.
-
-    Values above the limit look like it.
-    """
+    """Write values (H, W), from 0 to the limit or above it, as the colours of ``colour_stops``."""
     _save(path, _map(values, limit))
 
 
@@ -105,13 +99,11 @@ def save_panel(path: Path, pictures: Sequence[tuple[str, Tensor]], limit: float)
     height, width = pictures[0][1].shape[-2:]
     times = -(-_TALL // height)  # small pictures grow by whole pixels
     font = PIL.ImageFont.load_default(_TEXT)
-    shown = [
-        (title, picture(each) if each.ndim == 3 else _map(each, limit).convert("RGB"))
-        for title, each in pictures
-    ]
     if any(each.ndim == 2 for _, each in pictures):
         scale = torch.linspace(limit, 0, height)[:, None].expand(-1, max(1, width // 12))
-        shown.append((f"{LABEL}, 0 to {limit:g}", _map(scale, limit).convert("RGB")))
+        pictures = [*pictures, (f"{LABEL}, 0 to {limit:g}", scale)]
+    images = (picture(p) if p.ndim == 3 else _map(p, limit).convert("RGB") for _, p in pictures)
+    shown = list(zip((title for title, _ in pictures), images, strict=True))
     wide = [max(times * each.width, int(font.getlength(title))) + _TEXT for title, each in shown]
     panel = PIL.Image.new("RGB", (sum(wide), times * height + 2 * _TEXT), "white")
     pen = PIL.ImageDraw.Draw(panel)
@@ -138,8 +130,7 @@ def leave_panels(
     A panel has the photograph, the renders, and the fragments on one scale. Its name is added to
     the report, which is the record. Returns a line that says so.
     """
-    files = []
-    chosen = evenly_spaced(shots, PANELS)
+    files, chosen = [], evenly_spaced(shots, PANELS)
     for stem, shot in zip(stems([shot.name for shot in chosen]), chosen, strict=True):
         shown, heat = [(shot.target, shot.image)], []
         for name, candidate in columns.items():

@@ -25,14 +25,10 @@ RECORD_FILE = UntrustedFile(
 )
 """``RECORD_FILE.stated(record.path)`` is around whatever takes values out of a record."""
 
-CONTROL = "control"
-"""The goal of a control, as settings in records have it."""
-
+CONTROL = "control"  # the goal of a control, as settings in records have it
 _OF_CONTROLS = ("train", "opacity_lr", "seed", "views_per_step")
 _SAME_DB = 1e-3  # engines and machines differ by less in the PSNR of one model
-
-_NUMBERS = {"scale_modifier", "dilation", "near", "alpha_max"}
-"""Fields of ``RasterInputs`` that a record may set to a number."""
+_NUMBERS = {"scale_modifier", "dilation", "near", "alpha_max"}  # of ``RasterInputs``, as numbers
 
 
 @dataclass(frozen=True)
@@ -46,13 +42,7 @@ class Record:
 
 
 def leave(model: Path, command: str, data: dict[str, Any]) -> Path:
-    """Write a record beside a result; it replaces an earlier record.
-
-    Paths in it become relative to its folder, see ``portable``: a record may be given away.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write a record beside a result; paths become relative to its folder (``portable``)."""
     target = path_beside(model)
     content = {"format": FORMAT, "command": command, "data": portable(data, target.parent)}
     if model.is_file():
@@ -63,16 +53,11 @@ def leave(model: Path, command: str, data: dict[str, Any]) -> Path:
 
 
 def leave_or_tell(model: Path, command: str, data: dict[str, Any]) -> int:
-    """Leave a record. If it cannot be written, say so: its figures are still to be told.
-
-    Returns:
-        The exit code: 0, or 1 without a record.
-    """
+    """Leave a record; returns the exit code, 1 without one: its figures are still to be told."""
     try:
         leave(model, command, data)
     except OutputError as error:
-        said = f"{model} is written, its record is not: {error}"
-        click.echo(printable(said), err=True)
+        click.echo(printable(f"{model} is written, its record is not: {error}"), err=True)
         return 1
     return 0
 
@@ -85,10 +70,7 @@ def path_beside(result: Path) -> Path:
 def beside(result: Path) -> Record | None:
     """Read the record of a result; None if there is none or the result was rewritten since.
 
-    A copy may be newer than its record: there the content tells.
-
-    Raises:
-        RecordError: the record cannot be read.
+    A copy may be newer than its record: there the content tells. RecordError if it is broken.
     """
     path = path_beside(result)
     if not os.path.exists(path):
@@ -98,11 +80,7 @@ def beside(result: Path) -> Record | None:
 
 
 def find(folder: Path) -> list[Record]:
-    """Read all records in a folder and below, oldest first. Links out of the folder are not read.
-
-    Raises:
-        RecordError: there is no record, or a record cannot be read.
-    """
+    """Read all records in a folder and below, oldest first; RecordError if there is none."""
     found = files(folder, below=True)
     if not found:
         what, remedy = f"no file *{SUFFIX} in it or below", "Run one of these first."
@@ -118,19 +96,16 @@ def find(folder: Path) -> list[Record]:
 
 def files(folder: Path, *, below: bool = False) -> list[Path]:
     """The files of records in a folder, optionally also below it, oldest first."""
-    find_files = Path(folder).rglob if below else Path(folder).glob
-    inside = (path for path in find_files(f"*{SUFFIX}") if lies_in(path, folder))
-    return sorted(
-        (each for each in inside if os.path.exists(each)), key=lambda each: each.stat().st_mtime
-    )
+    every = Path(folder).glob(f"{'**/' if below else ''}*{SUFFIX}")
+    inside = [path for path in every if lies_in(path, folder) and os.path.exists(path)]
+    return sorted(inside, key=lambda path: path.stat().st_mtime)
 
 
 def portable(value: Any, folder: Path) -> Any:
     """A value whose texts name no folder of this machine, as far as paths can be recognised.
 
-    A text that is an absolute path becomes relative to ``folder``, or to ``~`` if only the path is
-    in the home folder; ``located`` finds it again. Inside other texts, ``folder`` is left out and
-    the home folder becomes ``~``.
+    Absolute paths become relative to ``folder``, or to ``~`` if only the path is in the home
+    folder; ``located`` finds them again. Other texts lose ``folder``, and say ``~`` for the home.
     """
     homes, (near, base) = _spellings(Path.home()), _spellings(folder)
     short = ((near, ""), (base, ""), *((home, "~" + os.sep) for home in homes))
@@ -196,11 +171,7 @@ def plain(photographs: Photographs) -> dict[str, Any]:
 
 
 def recorded(record: Record) -> Recorded | None:
-    """The photographs and models of a record; None if it names none.
-
-    Raises:
-        RecordError: they are of other types.
-    """
+    """The photographs and models of a record; None if it names none. RecordError of other types."""
     with RECORD_FILE.stated(record.path) as reading:
         values = record.data.get("photographs")
         if values is None:
@@ -227,12 +198,11 @@ def recorded(record: Record) -> Recorded | None:
 
 
 def control_of(data: dict[str, Any], among: Sequence[Path]) -> dict[str, Any] | None:
-    """Find the measurement of a fine-tuning's control; None if no file records it.
+    """Find the measurement of a fine-tuning's control; None if no file records it. The last counts.
 
-    The control started from the same model, by the same host's loop and options or ours, on the
-    same photographs as far as is known, with the same iterations, views in each step, seed and
-    settings, and kept as many Gaussians or all, but without truncation and without a stop or a
-    dropout of its own. Of several the last counts. Files that are not records are ignored.
+    It started from the same model, by the same loop and options, on the same photographs as far as
+    is known, with the same iterations, views in each step, seed and settings, and kept as many
+    Gaussians or all, but without truncation and without a stop or a dropout of its own.
     """
     for path in reversed(among):
         with contextlib.suppress(RecordError), RECORD_FILE.stated(path):
@@ -278,8 +248,4 @@ def _read(path: Path) -> Record:
 
 def strict(value: Any) -> Any:
     """Replace NaN and infinity by null, because JSON has neither."""
-
-    def known(value: Any) -> Any:
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    return _each(value, known)
+    return _each(value, lambda v: None if isinstance(v, float) and not math.isfinite(v) else v)

@@ -6,9 +6,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import Any, overload
 
 import torch
+from PIL.Image import Image
 from torch import Tensor
 
 from fragprune_plugins.engines import Engine
@@ -21,9 +22,6 @@ from fragprune_plugins.workbench.figures.pictures import picture
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.scenes.generated import bounds, not_too_near
 from fragprune_plugins.workbench.scenes.pinhole import look_at
-
-if TYPE_CHECKING:
-    from PIL.Image import Image
 
 
 def overview(
@@ -43,8 +41,7 @@ def overview(
     Args:
         model: N Gaussians, the result of a training, or a file.
         up: (3,) what is up in its world; COLMAP's worlds have y down.
-        width: pixels.
-        height: pixels.
+        width, height: pixels.
         fov_y: vertical field of view, degrees; less for a splat of 0.15 units or less, of which
             hosts would leave out what is nearer than 0.2.
 

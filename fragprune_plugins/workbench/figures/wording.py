@@ -15,12 +15,8 @@ from fragprune_plugins.workbench.figures.records import CONTROL
 from fragprune_plugins.workbench.goals import Faster, parse_goal
 
 _EQUAL = 0.005  # a ratio of fragments that reads 1.00
-
-CLAIMED = 2
-"""Frame times count as different if they differ by this many standard errors."""
-
-FELL = 0.5
-"""A loss of PSNR, in dB, that is warned of."""
+CLAIMED = 2  # frame times count as different if they differ by this many standard errors
+FELL = 0.5  # a loss of PSNR, in dB, that is warned of
 
 CONTROLLED_BY = {
     "run": "--stage finetune --control to the same command",
@@ -28,14 +24,9 @@ CONTROLLED_BY = {
 }
 """How a user runs a control so that later results find it."""
 
-IS_CONTROL = ": a control, nothing is truncated."
-"""Ends the sentence on one."""
-
-ITSELF = "itself"
-"""The target of a measurement against the model's own pictures, as it came in."""
-
-VISIBLE = 35.0
-"""A PSNR against itself, in dB, below which one is warned."""
+IS_CONTROL = ": a control, nothing is truncated."  # ends the sentence on one
+ITSELF = "itself"  # the target of a measurement against the model's own pictures, as it came in
+VISIBLE = 35.0  # a PSNR against itself, in dB, below which one is warned
 
 _ROWS = (
     ("PSNR, dB", "psnr", 2),
@@ -47,8 +38,7 @@ _ROWS = (
     ("Gaussians", "gaussians", 0),
 )
 
-_DIFFERENCES = ("psnr", "ssim", "lpips")
-"""Figures whose change is a difference; that of others is a ratio."""
+_DIFFERENCES = ("psnr", "ssim", "lpips")  # their change is a difference, that of others a ratio
 
 
 def columns_of(data: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
@@ -68,16 +58,13 @@ def profiled(data: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 def describe(columns: Mapping[str, dict[str, Any]]) -> str:
     """A table with a column for each measurement, and the change between the last two."""
-    lines = []
-    for first, *cells in tabulate(columns):
-        change = f"{cells.pop():>15}" if len(columns) > 1 else ""
-        lines.append(f"{first:<31}" + "".join(f"{cell:>16}" for cell in cells) + change)
-    return "\n".join([*lines, measured_with(columns)])
+    form = "{:<31}" + "{:>16}" * len(columns) + ("{:>15}" if len(columns) > 1 else "")
+    return "\n".join([*(form.format(*row) for row in tabulate(columns)), measured_with(columns)])
 
 
 def measured_with(columns: Mapping[str, dict[str, Any]]) -> str:
     """What the last measurement was made with: views, engine, device."""
-    report = list(columns.values())[-1]
+    *_, report = columns.values()
     made = f"{report['engine']} engine on {report['device']}"
     return f"Means over {_views(report)}, ± a standard error; {made}"
 
@@ -97,10 +84,8 @@ def tabulate(columns: Mapping[str, dict[str, Any]]) -> list[list[str]]:
             continue
         cells = [f"{report[key]:.{digits}f}" for report in reports]
         if key == "frame_ms":
-            cells = [
-                f"{cell} ± {report['frame_ms_se']:.{digits}f}"
-                for cell, report in zip(cells, reports, strict=True)
-            ]
+            errors = [f"{report['frame_ms_se']:.{digits}f}" for report in reports]
+            cells = [" ± ".join(pair) for pair in zip(cells, errors, strict=True)]
         if change:
             first, last = reports[-2][key], reports[-1][key]
             if key in _DIFFERENCES:
@@ -129,10 +114,7 @@ def nothing_drawn(fragments: Sequence[float]) -> list[str]:
 
 
 def gain(before: dict[str, Any], after: dict[str, Any], enlarge: int = 1) -> str:
-    """A phrase for the gain of one measurement over another: fragments, frame times, PSNR.
-
-    Timed frames are ``enlarge`` times as wide and high as the pictures.
-    """
+    """A phrase for the gain of one measurement over another: fragments, frame times, PSNR."""
     return (
         f"{fewer(before['fragments_per_pixel'], after['fragments_per_pixel'])}, "
         f"{frames(before, after, enlarge)}, {quality(before, after)} on {_views(after)}"
@@ -159,32 +141,29 @@ def _same(report: dict[str, Any]) -> bool:
 def outcome(command: str, data: dict[str, Any], control: dict[str, Any] | None) -> str:
     """A sentence for the gain of a fine-tuning on held-out views, and for the control's share.
 
-    Args:
-        data: its figures; with "seen", which records may lack: whether the training before it held
-            nothing out.
-        control: what as many iterations without truncation gave; None if not run.
+    In its figures, "seen" is whether the training before it held nothing out. The control is what
+    as many iterations without truncation gave, if they were run.
     """
     before, after = data["before"], data["after"]
     held = f"that {'was' if after['views'] == 1 else 'were'} held out"
     held = "that its training had seen" if data.get("seen") else held
-    gained = f"{gain(before, after)} {held}"
     if data["settings"]["goal"] == CONTROL:
-        said = f"{gained}{IS_CONTROL}"
+        then = IS_CONTROL
     elif after.get("target") == ITSELF:
-        said = f"{gained}. No photograph was used."
+        then = ". No photograph was used."
     elif control is None:
-        said = (
-            f"{gained}. More training alone may be a part of the dB: no control was found; "
+        then = (
+            ". More training alone may be a part of the dB: no control was found; "
             f"to see, add {CONTROLLED_BY[command]}."
         )
     else:
-        said = (
-            f"{gained}. The control, as many iterations without pruning, has "
+        then = (
+            ". The control, as many iterations without pruning, has "
             f"{control['fragments_per_pixel']:.1f} fragments per pixel and "
             f"{control['psnr'] - before['psnr']:+.2f} dB: pruning itself makes "
             f"{_by_pruning(before, after, control):+.2f} dB."
         )
-    return said + missed(data) + _fell(before, after, control)
+    return f"{gain(before, after)} {held}{then}{missed(data)}{_fell(before, after, control)}"
 
 
 def outcome_in_training(data: Mapping[str, Any]) -> str:
@@ -199,7 +178,6 @@ def outcome_in_training(data: Mapping[str, Any]) -> str:
 def headlines(data: Mapping[str, Any], control: dict[str, Any] | None) -> list[tuple[str, str]]:
     """Fragments, frame time, picture of a fine-tuning: (the figure, what it says) of each."""
     before, after = data["before"], data["after"]
-    was, now = (each["fragments_per_pixel"] for each in (before, after))
     slow, fast = (each["frame_ms"] for each in (before, after))
     faster, _, claimed = _faster(before, after)
     if claimed:
@@ -208,14 +186,15 @@ def headlines(data: Mapping[str, Any], control: dict[str, Any] | None) -> list[t
         frame = f"{slow:.1f} → {fast:.1f} ms", "for frames: no difference beyond the noise"
     if after.get("target") == ITSELF:
         figure = "equal" if _same(after) else f"{after['psnr']:.1f} dB"
-        picture = figure, "PSNR of the picture against the original's own"
+        against = "of the picture against the original's own"
     elif control is not None:
-        gained = _by_pruning(before, after, control)
-        picture = f"{gained:+.2f} dB", "PSNR against the same training without pruning"
+        figure = f"{_by_pruning(before, after, control):+.2f} dB"
+        against = "against the same training without pruning"
     else:
-        said = "PSNR against the original; more training may be a part of it"
-        picture = f"{after['psnr'] - before['psnr']:+.2f} dB", said
-    return [_drawn(was, now), frame, picture]
+        figure = f"{after['psnr'] - before['psnr']:+.2f} dB"
+        against = "against the original; more training may be a part of it"
+    drawn = _drawn(*(each["fragments_per_pixel"] for each in (before, after)))
+    return [drawn, frame, (figure, f"PSNR {against}")]
 
 
 def _drawn(was: float, now: float) -> tuple[str, str]:
@@ -223,9 +202,8 @@ def _drawn(was: float, now: float) -> tuple[str, str]:
     least, most = sorted((was, now))
     if not least:
         return f"{was:.1f} → {now:.1f}", "fragments to draw a pixel"
-    ratio, word = most / least, "fewer" if was > now else "more"
-    if ratio - 1 < _EQUAL:
-        word = "as many"
+    ratio = most / least
+    word = "as many" if ratio - 1 < _EQUAL else "fewer" if was > now else "more"
     figure = f"{ratio:.2f}x" if ratio < 1.1 else f"{ratio:.1f}x"
     return figure, f"{word} fragments to draw: {was:.1f} → {now:.1f} a pixel"
 
@@ -237,10 +215,8 @@ def _by_pruning(before: dict[str, Any], after: dict[str, Any], control: dict[str
 
 
 def next_steps(model: Path | None, folder: Path, scene: Path | None = None) -> str:
-    """A line on what to do with a model that a command wrote, and with the record in a folder.
-
-    ``model`` is None if ``view`` does not show it. ``scene`` is the folder of its photographs:
-    elsewhere, ``report`` reads it only by name.
+    """A line on what to do with a model that a command wrote, if ``view`` shows it, and with the
+    record in a folder. Photographs in a ``scene`` elsewhere are read by ``report`` only by name.
     """
     look = f"Look at it: fragprune view {quoted(model)}. " if model else ""
     data = "" if scene is None or lies_in(scene, folder) else f" --data {quoted(scene)}"
@@ -281,13 +257,13 @@ def bounded(data: Mapping[str, Any]) -> str:
     found = data["max_drop"]
     if "loss" not in found:
         return "No training was compared with the control."
-    tried = f"of {len(found['trials'])} trained"
-    chosen = f"the strongest pruning {tried}" if found["met"] else f"the least loss {tried}"
+    chosen = "the strongest pruning" if found["met"] else "the least loss"
     missed = "" if found["met"] else f" The bound of {found['bound']:g} dB was missed."
     return (
         f"Loss against the control: {found['loss']:.3f} dB at pressure {found['pressure']:.2g}, "
-        f"{chosen}. The pressure was chosen on these {data['after']['views']} views; others of "
-        f"their kind may differ by some {found['loss_se']:.2f} dB.{missed}"
+        f"{chosen} of {len(found['trials'])} trained. The pressure was chosen on these "
+        f"{data['after']['views']} views; others of their kind may differ by some "
+        f"{found['loss_se']:.2f} dB.{missed}"
     )
 
 

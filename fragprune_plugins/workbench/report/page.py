@@ -5,35 +5,24 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
 
+from fragprune_plugins.engines import Engine
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.learning.stage2 import evenly_spaced
-from fragprune_plugins.workbench.figures import page
-from fragprune_plugins.workbench.figures.evaluate import Candidate, enlarged
-from fragprune_plugins.workbench.figures.pictures import save_image, save_map, stems
-from fragprune_plugins.workbench.figures.wording import measured_with, tabulate
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from fragprune_plugins.engines import Engine
-    from fragprune_plugins.workbench.scenes.dataset import Shot
+from fragprune_plugins.workbench.figures import evaluate, page, pictures, wording
+from fragprune_plugins.workbench.scenes.dataset import Shot
 
 TEMPLATE = Path(__file__).with_name("report.html")
-
 LEARNING = "learning.png"
-SHOWN = 3
-"""Views on the page."""
-
-NAMES = ("original", "pruned")
-"""Of the two models of a page, and of their pictures."""
-
+SHOWN = 3  # views on the page
+NAMES = ("original", "pruned")  # of the two models of a page, and of their pictures
 _GREY = "#888888"  # can be read on white and on black
 
 
@@ -50,10 +39,10 @@ class Shown:
 class Drawn:
     """Views that were drawn for a page, on shared scales."""
 
-    views: Sequence[Shown]
-    target: str  # what they were compared with, in words
-    most_fragments: float  # per pixel, at the top of the scale
-    most_error: float  # likewise, the difference to the photograph in 8-bit levels
+    views: Sequence[Shown] = ()
+    target: str = ""  # what they were compared with, in words
+    most_fragments: float = 1.0  # per pixel, at the top of the scale
+    most_error: float = 1.0  # likewise, the difference to the photograph in 8-bit levels
 
     @property
     def files(self) -> list[str]:
@@ -70,52 +59,43 @@ def compose(
     labels: Sequence[str] = NAMES,
     **values: Any,
 ) -> str:
-    """A page of a result as HTML.
+    """A page of a result as HTML, by ``TEMPLATE`` or one that extends it, which gets the values.
 
-    Args:
-        template: ``TEMPLATE``, or one that extends it.
-        source: turns a picture's file name into its ``src``, a relative path or a data URL.
-        labels: what people read for the two models.
-        values: title; facts, (number, words) of each; quote, a sentence; seen, whether the training
-            saw the views; notes; table; plots, (heading, file) of each; others, with heading,
-            sentence and table; settings, a table.
+    ``source`` turns a picture's file name into its ``src``, a relative path or a data URL. Of
+    ``values``, facts are (number, words) each, plots (heading, file), and others have a heading, a
+    sentence and a table.
     """
-    shown = vars(drawn or Drawn((), "", 1.0, 1.0))
-    values |= shown | {"source": source, "names": NAMES, "labels": labels}
+    values |= vars(drawn or Drawn()) | {"source": source, "names": NAMES, "labels": labels}
     return page.render(template, TEMPLATE.parent, **values)
 
 
 def draw_views(
     folder: Path,
-    original: Candidate,
-    pruned: Candidate,
+    original: evaluate.Candidate,
+    pruned: evaluate.Candidate,
     shots: Sequence[Shot],
     engine: Engine,
     enlarge: int = 1,
 ) -> Drawn:
-    """Draw some evenly spread views: photograph, both models, and maps of both.
+    """Draw some evenly spread views into a folder: photograph, both models, and maps of both.
 
     The maps show the fragments of each pixel, and the largest difference of a channel to the
-    photograph.
-
-    Args:
-        folder: for the PNGs, which ``Drawn.files`` names.
-        enlarge: how many times as wide and high as the photograph both models are drawn.
+    photograph. Models are drawn ``enlarge`` times as wide and high as this.
     """
     chosen = [shot.to(original.model.device) for shot in evenly_spaced(shots, SHOWN)]
-    names = stems([shot.name for shot in chosen])
+    names = pictures.stems([shot.name for shot in chosen])
     maps: dict[str, dict[str, Tensor]] = {"fragments": {}, "error": {}}
     views = []
     for name, shot in zip(names, chosen, strict=True):
-        size, large = (shot.view.width, shot.view.height), enlarged(shot.view, enlarge)
-        save_image(folder / f"{name}_photograph.png", shot.image)
+        size, large = (shot.view.width, shot.view.height), evaluate.enlarged(shot.view, enlarge)
+        pictures.save_image(folder / f"{name}_photograph.png", shot.image)
         per_pixel = []
         for model, each in zip(NAMES, (original, pruned), strict=True):
             with torch.no_grad():
                 out = each.draw(engine, large, counts=True)
                 image = out.image if enlarge == 1 else each.draw(engine, shot.view).image
             assert out.fragments is not None
-            save_image(folder / f"{name}_{model}.png", out.image)
+            pictures.save_image(folder / f"{name}_{model}.png", out.image)
             error = shot.looked_at(image).clamp(0, 1) - shot.image.clamp(0, 1)
             maps["fragments"][f"{name}_{model}"] = out.fragments
             maps["error"][f"{name}_{model}"] = 255 * error.abs().amax(dim=0)
@@ -125,7 +105,7 @@ def draw_views(
     for kind, values in maps.items():
         limits[kind] = shared_limit(list(values.values()))
         for stem, each_map in values.items():
-            save_map(folder / f"{stem}_{kind}.png", each_map, limits[kind])
+            pictures.save_map(folder / f"{stem}_{kind}.png", each_map, limits[kind])
     target = "Photograph" if chosen[0].target == "photographs" else "The original's own picture"
     return Drawn(views, target, limits["fragments"], limits["error"])
 
@@ -164,8 +144,8 @@ def shared_limit(maps: Sequence[Tensor]) -> float:
 
 def figures(columns: Mapping[str, dict[str, Any]]) -> page.Table:
     """A table of measurements by name of the model, with the change between the last two."""
-    head, *rows = tabulate(columns)
-    return page.Table(head, rows, measured_with(columns))
+    head, *rows = wording.tabulate(columns)
+    return page.Table(head, rows, wording.measured_with(columns))
 
 
 def save_learning(
@@ -173,11 +153,8 @@ def save_learning(
 ) -> None:
     """Draw loss, fragments and median threshold over the steps, and all thresholds at the end.
 
-    Lines and words are grey and the rest is transparent: a page may be light or dark.
-
-    Args:
-        curves: one dict a step, from a run's summary; None, in records, is what is not known.
-        thresholds: (N,) learned, falloff; None, of a control, leaves out what shows them.
+    Lines and words are grey and the rest is transparent: a page may be light or dark. Without
+    thresholds (N,), as of a control, what shows them is left out.
     """
     rows = 1 if thresholds is None else 2
     figure = Figure(figsize=(8, 2.8 * rows), layout="constrained", facecolor="none")
@@ -201,13 +178,12 @@ def save_learning(
         final = thresholds.detach().cpu().numpy()
         spread.hist(np.maximum(final, 1e-4), bins=np.geomspace(1e-4, 1, 60), color="tab:blue")
         spread.set(xscale="log", xlabel="cutoff (falloff)", ylabel="Gaussians")
-    for axes in (loss, fragments, *others):
+    for axes in figure.axes:
         axes.grid(alpha=0.25)
         axes.set_facecolor("none")
         axes.tick_params(which="both", colors=_GREY)
         axes.xaxis.label.set_color(_GREY)
         axes.yaxis.label.set_color(_GREY)
-        for spine in axes.spines.values():
-            spine.set_color(_GREY)
+        axes.spines[:].set_color(_GREY)
     with replacing(path) as temporary:
         figure.savefig(temporary, format="png", dpi=120)

@@ -31,11 +31,8 @@ from fragprune_plugins.workbench.report.page import Drawn
 from fragprune_plugins.workbench.scenes.dataset import Dataset, load_photographs
 
 PAGE = "report.html"
-
 _PNG = b"\x89PNG\r\n\x1a\n"
-
 _PICTURE = UntrustedFile(RecordError, "no picture", "a PNG", "Remove it.", limit=64 * MEBIBYTE)
-
 _HOW = "Name the scene with --data: then it is read, and so are the models of the record."
 
 _ONLY_CONTROLS = (
@@ -55,18 +52,19 @@ def report(*, folder: Path, out: Path | None, data: Path | None, engine: EngineO
     control = _goal(main) == CONTROL
     files = [record.path for record in every]
     line = _sentence(main, files)
+    facts, begun = _measured(main, files)
     with TemporaryDirectory() as name:
         pictures = Path(name)
         drawn, learning, missing = _draw(main, folder, pictures, data, partial(open_engine, engine))
         more = [*learning, *_files(every, folder, pictures)]
-        notes = [*_begun(main), *map(_outdated, every), _ONLY_CONTROLS if control else "", missing]
+        notes = [*begun, *map(_outdated, every), _ONLY_CONTROLS if control else "", missing]
         notes = [note for note in notes if note]
         text = report_page.compose(
             report_page.TEMPLATE,
             drawn,
             lambda file: embedded(pictures / file),
             title=f"{_heading(main)} of {_of(main, folder)}",
-            facts=_facts(main, files),
+            facts=facts,
             quote=line,
             seen=bool(main.data.get("seen")),
             labels=("original", "control") if control else report_page.NAMES,
@@ -105,8 +103,7 @@ def _check(record: Record) -> None:
         _table(record)
         _sentence(record, [])
         _settings(record)
-        _facts(record, [])
-        _begun(record)
+        _measured(record, [])
         for name in record.data.get("files", ()):
             Path(name)
 
@@ -127,12 +124,9 @@ def _table(record: Record) -> Table:
     if columns:
         return report_page.figures(columns)
     seen = record.data["training_views"]
-    drawn = [_number(seen[f"fragments_per_pixel_{when}"]) for when in ("before", "after")]
-    return Table(["on training views", "before", "after"], [["fragments per pixel", *drawn]])
-
-
-def _number(value: float | None) -> str:
-    return "unknown" if value is None else f"{value:.2f}"
+    drawn = [seen[f"fragments_per_pixel_{when}"] for when in ("before", "after")]
+    cells = ["unknown" if each is None else f"{each:.2f}" for each in drawn]
+    return Table(["on training views", "before", "after"], [["fragments per pixel", *cells]])
 
 
 def _sentence(record: Record, among: Sequence[Path]) -> str:
@@ -177,26 +171,15 @@ def _of(record: Record, folder: Path) -> str:
     return name or folder.resolve().name
 
 
-def _facts(record: Record, among: Sequence[Path]) -> list[tuple[str, str]]:
-    """The three figures of a fine-tuning that was measured; else none."""
+def _measured(record: Record, among: Sequence[Path]) -> tuple[list[tuple[str, str]], list[str]]:
+    """Of a fine-tuning that was measured before and after: its three figures, and lines on what
+    came before it and what a bound found. Of others none.
+    """
     data = record.data
-    if not _compared(record):
-        return []
-    return wording.headlines(data, data.get("control") or records.control_of(data, among))
-
-
-def _begun(record: Record) -> list[str]:
-    """Lines on what came before a fine-tuning that was measured, and on what a bound found."""
-    if not _compared(record):
-        return []
-    bounded = [wording.bounded(record.data)] if record.data.get("max_drop") else []
-    return wording.begun(record.data) + bounded
-
-
-def _compared(record: Record) -> bool:
-    """Whether it is of a fine-tuning, measured before and after."""
-    data = record.data
-    return record.command in ("run", "finetune") and bool(data.get("before") and data.get("after"))
+    if not (record.command in ("run", "finetune") and data.get("before") and data.get("after")):
+        return [], []
+    facts = wording.headlines(data, data.get("control") or records.control_of(data, among))
+    return facts, wording.begun(data) + ([wording.bounded(data)] if data.get("max_drop") else [])
 
 
 def _settings(record: Record) -> list[list[str]]:
@@ -204,11 +187,8 @@ def _settings(record: Record) -> list[list[str]]:
     keys = ("adapter", "engine", "device", "iterations", "gaussians", "train_seconds", "seed")
     facts = {key: record.data.get(key) for key in keys} | record.data.get("settings", {})
     facts |= {key: record.data.get(key) for key in ("model", "model_before", "model_after", "out")}
-    return [
-        [key.replace("_", " "), f"{value:.4g}" if isinstance(value, float) else str(value)]
-        for key, value in facts.items()
-        if value is not None
-    ]
+    known = {key.replace("_", " "): value for key, value in facts.items() if value is not None}
+    return [[k, f"{v:.4g}" if isinstance(v, float) else str(v)] for k, v in known.items()]
 
 
 @dataclass(frozen=True)
@@ -224,16 +204,14 @@ class _Source:
 
 def _source(record: Record, data: Path | None) -> _Source | None:
     """The source of a record's views; ``data`` is the scene that the user named."""
-    own = own_cameras(record)
-    if own is not None:
+    if own := own_cameras(record):
         with RECORD_FILE.stated(record.path):
             both = (record.data["model"], record.data["out"])
             models = [records.located(name, record.path.parent) for name in both]
         needs = list(filter(None, [own.scene.data, own.cameras]))
         pictures = own.pictures if needs else partial(_from_above, own)
         return _Source(models, False, {}, needs, pictures)
-    read = recorded(record)
-    if read is None:
+    if (read := recorded(record)) is None:
         return None
     scene = read.photographs if data is None else replace(read.photographs, folder=data)
     how = read.filtered, read.drawing, [scene.folder]
@@ -253,14 +231,10 @@ def _draw(
     data: Path | None,
     opened: Callable[[], tuple[Engine, torch.device]],
 ) -> tuple[Drawn | None, list[tuple[str, str]], str]:
-    """Draw held-out views and learning curves into a folder.
+    """Draw held-out views and learning curves into a folder; with an engine only if there are any.
 
-    Args:
-        inside: the folder whose files may be read without ``data``, which the user named.
-        opened: opens the engine; called only if there is something to draw.
-
-    Returns:
-        The views, (heading, file) of further pictures, and why views are missing, or "".
+    Files ``inside`` may be read without ``data``, which the user named. Returns the views,
+    (heading, file) of further pictures, and why views are missing, or "".
     """
     source, curves = _source(record, data), record.data.get("curves")
     if source is None:
@@ -297,16 +271,13 @@ def _outdated(record: Record) -> str:
     """A line for a result that was written over since its figures were taken; "" else."""
     name = Path(str(record.data.get("model_after") or record.data.get("out"))).name
     result = record.path.parent / name
-    if not (record.sha256 and result.is_file()) or records.beside(result):
-        return ""
-    return f"{name} was written again since: its figures are of the file before."
+    if record.sha256 and result.is_file() and not records.beside(result):
+        return f"{name} was written again since: its figures are of the file before."
+    return ""
 
 
 def _files(every: list[Record], inside: Path, folder: Path) -> list[tuple[str, str]]:
-    """Copy pictures of compare and profile into the folder; returns (heading, file) of each.
-
-    Only PNGs beside the record, and no link out of ``inside``.
-    """
+    """Copy PNGs of compare and profile that lie ``inside``; returns (heading, file) of each."""
     found: list[tuple[str, str]] = []
     for record in every:
         for name in record.data.get("files", ()):
@@ -314,9 +285,8 @@ def _files(every: list[Record], inside: Path, folder: Path) -> list[tuple[str, s
             if not lies_in(file, inside):
                 continue
             with contextlib.suppress(RecordError), _PICTURE.reading(file) as reading:
-                content = reading.file.read()
+                content, copy = reading.file.read(), f"{len(found)}.png"
                 if content.startswith(_PNG):
-                    copy = f"{len(found)}.png"
                     (folder / copy).write_bytes(content)
                     view = file.stem.removesuffix("_panel")
                     found.append((f"{_heading(record)}: {view}", copy))
