@@ -16,22 +16,15 @@ import numpy.typing as npt
 
 from fragprune_plugins.errors import InputError
 
-NEUTRAL = 0
-"""The code that cuts nothing."""
-
-STEP = 2 * math.log(255) / 256
-"""Q of one code: 0.0433."""
+NEUTRAL = 0  # the code that cuts nothing
+STEP = 2 * math.log(255) / 256  # Q of one code: 0.0433
 
 
 def encode(thresholds: npt.ArrayLike) -> npt.NDArray[np.uint8]:
-    """The nearest codes in Q of thresholds of any shape, in [0, 1].
+    """The nearest codes in Q of thresholds of any shape, in [0, 1]; else it is an InputError.
 
     Q of the result is at most half a STEP (0.0217) away, so tau is within 1.1 %. Two ends differ:
-    every threshold up to 1/255 becomes code 0, and one above 255^(-1/512) = 0.989 becomes code 255,
-    0.979.
-
-    Raises:
-        InputError: a threshold is NaN, negative or above 1.
+    thresholds up to 1/255 become code 0, and those above 255^(-1/512) = 0.989 code 255, 0.979.
     """
     tau = np.asarray(thresholds, dtype=np.float64)
     if not ((tau >= 0) & (tau <= 1)).all():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import tempfile
 from dataclasses import replace
@@ -18,13 +19,9 @@ from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.finite import expect_finite
 from fragprune_plugins.workbench.models import formats
 
-_STEP = 0.1
-"""Of a Gaussian's width: of one scene pictures were 57 dB from exact ones at 0.02, 22 dB at 2."""
-
+_STEP = 0.1  # of a Gaussian's width: pictures were 57 dB from exact ones at 0.02, 22 dB at 2
 _warn = cache(log.warning)  # once, because commands read a file several times
-
-DEFORMATION = "deformation.pth"
-"""The network that 4DGaussians saves beside a PLY."""
+DEFORMATION = "deformation.pth"  # the network that 4DGaussians saves beside a PLY
 
 
 class Trained(Protocol):
@@ -36,11 +33,7 @@ class Trained(Protocol):
 
 
 def of(given: Model | Trained | str | Path) -> Model:
-    """A model as it is, out of a result, or from its file.
-
-    Raises:
-        ModelFileError, SidecarError: as ``load``.
-    """
+    """A model as it is, out of a result, or from its file, as ``load`` reads it."""
     if isinstance(given, str | Path):
         return load(given)
     return given if isinstance(given, Model) else given.model
@@ -67,13 +60,10 @@ def load(
     """
     path = Path(path)
     if path.with_name(DEFORMATION).exists():
-        raise ModelFileError(
-            str(path),
-            f"Gaussians that no view shows: the network beside them ({DEFORMATION}) moves them for "
-            "each moment",
-            "a model that one file holds",
-            "Draw it with its training code: fragprune run -- python render.py -m OUTPUT.",
-        )
+        moved = f"the network beside them ({DEFORMATION}) moves them for each moment"
+        found, expected = f"Gaussians that no view shows: {moved}", "a model that one file holds"
+        remedy = "Draw it with its training code: fragprune run -- python render.py -m OUTPUT."
+        raise ModelFileError(str(path), found, expected, remedy)
     paired = truncation and formats.found(path).paired
     while True:  # until nobody replaced the pair meanwhile
         before = _versions(path)
@@ -92,10 +82,7 @@ def load(
 
 
 def _warn_if_far(path: Path, model: Model) -> None:
-    """Warn of positions, as of georeferenced scenes, at which float32 has steps too wide for them.
-
-    Cameras there are rounded as roughly, so pictures of the same model differ between engines.
-    """
+    """Warn of positions, as of georeferenced scenes, at which float32 has too wide steps."""
     far, wide = model.xyz.abs().amax(dim=1), model.scaling.amax(dim=1).exp()
     step, size = (float(each.median()) for each in (far * torch.finfo(far.dtype).eps, wide))
     if step > _STEP * size:
@@ -119,25 +106,19 @@ def _warn_if_activated(path: Path, model: Model) -> None:
 
 def _versions(path: Path) -> list[tuple[int, ...] | None]:
     """What changes when another process replaces a model or its sidecar."""
-    found: list[tuple[int, ...] | None] = []
-    for each in (path, sidecar.path_beside(path)):
-        try:
+    found: list[tuple[int, ...] | None] = [None, None]
+    for index, each in enumerate((path, sidecar.path_beside(path))):
+        with contextlib.suppress(OSError):
             stat = each.stat()
-            found.append((stat.st_ino, stat.st_mtime_ns, stat.st_size))
-        except OSError:
-            found.append(None)
+            found[index] = (stat.st_ino, stat.st_mtime_ns, stat.st_size)
     return found
 
 
 def save(path: str | Path, model: Model | Trained) -> None:
-    """Write a model with its thresholds into one file, whole or not at all.
+    """Write a model with its thresholds, or the result of a training, whole or not at all.
 
-    The sidecar of a host's earlier PLY of this name goes with that model.
-
-    Args:
-        path: of the file; its suffix names the format. A PLY holds thresholds in the column
-            ``trunc_threshold``, other formats by extensions of theirs.
-        model: what to write, or the result of a training.
+    The suffix names the format. A PLY holds thresholds in the column ``trunc_threshold``, other
+    formats by extensions of theirs. The sidecar of a host's earlier PLY of this name goes with it.
 
     Raises:
         OutputError: the place cannot be written, its name is no model's, the format cannot hold
@@ -171,21 +152,16 @@ def writable_folder(path: Path) -> Path:
         with tempfile.TemporaryFile(dir=path):
             pass
     except OSError as error:
-        raise OutputError(
-            str(path),
-            f"cannot be written ({error.strerror or error})",
-            "a folder one can write to",
-            "Choose another output folder.",
-        ) from error
+        found = f"cannot be written ({error.strerror or error})"
+        expected = "a folder one can write to"
+        raise OutputError(str(path), found, expected, "Choose another output folder.") from error
     return path
 
 
 def require_place(out: Path, model: Path, *, thresholds: bool = True) -> None:
-    """Check, before any work, that ``out`` can be written and is not ``model``, which is read.
+    """Check, before any work, that ``out`` can be written, and thresholds into its format.
 
-    Raises:
-        UsageError: ``out`` and ``model`` have the same name, or of two PLYs that of their sidecar.
-        OutputError: ``out`` cannot be written, or its format cannot hold thresholds.
+    It is a UsageError if it has the name of ``model``, or of two PLYs that of their sidecar.
     """
     form = formats.named(out)
     if thresholds:

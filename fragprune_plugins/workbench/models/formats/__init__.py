@@ -21,32 +21,25 @@ from fragprune_plugins.plugins.points import CODE, blaming, load, offered
 if TYPE_CHECKING:
     from fragprune_plugins.files.model import Model
 
-GROUP = "fragprune.formats"
-"""The entry-point group of formats."""
+GROUP = "fragprune.formats"  # the entry-point group of formats
 
 
 @dataclass(frozen=True)
 class Format:
     """A file format of models.
 
-    Attributes:
-        suffix: the end of a file's name.
-        read: gives the model of an open file.
-        write: writes a model on the CPU into an open file; ValueError says what the format cannot
-            hold.
-        thresholds: how a file holds thresholds, such as "to 8 bits"; "" if it cannot hold any.
-        keeps: what else of a model the format keeps, as words for the user; "" if it keeps every
-            bit.
-        claims: whether a file with a suffix of PLY is of this format.
+    ``write`` gets a model on the CPU; its ValueError says what the format cannot hold. Of a model
+    files hold ``thresholds``, such as "to 8 bits", and keep what ``keeps`` says; "" means none, and
+    every bit.
     """
 
     name: str
-    suffix: str
+    suffix: str  # the end of a file's name
     read: Callable[[Reading], Model]
     write: Callable[[BinaryIO, Model], None]
     thresholds: str = ""
     keeps: str = ""
-    claims: Callable[[Path], bool] = lambda path: False
+    claims: Callable[[Path], bool] = lambda path: False  # whether a PLY is of this format
 
     @property
     def paired(self) -> bool:
@@ -110,10 +103,9 @@ def found(path: Path) -> Format:
 
 
 def read(path: Path, *, filtered: bool = False) -> Model:
-    """Read a model of any format; thresholds that the file itself holds are in the result.
+    """Read a model of any format, with the thresholds of the file; ``filtered`` as in ``read_ply``.
 
-    ``filtered`` is that of ``read_ply``. A file that is missing, truncated, of another kind, empty
-    or not finite raises ModelFileError.
+    A file that is missing, truncated, of another kind, empty or not finite: ModelFileError.
     """
     from fragprune_plugins.files.ply import expect_drawable, read_ply
 
@@ -123,9 +115,8 @@ def read(path: Path, *, filtered: bool = False) -> Model:
     with _FILE.reading(path) as reading:
         model = form.read(reading)
         if not hasattr(model, "xyz"):
-            given = f"{type(model).__name__} from {path}"
-            remedy = "Update or uninstall its package."
-            raise PluginError(f"format {form.name}", given, "a Model", remedy)
+            kind, remedy = type(model).__name__, "Update or uninstall its package."
+            raise PluginError(f"format {form.name}", f"{kind} from {path}", "a Model", remedy)
         expect_drawable(path, model)
         return model
 
@@ -143,12 +134,9 @@ def write(form: Format, new: Path, model: Model) -> None:
         write_ply(new, model)
         return
     if model.filter_3d is not None:
-        raise OutputError(
-            new.name,
-            f"a {form.name} file, which cannot hold Mip-Splatting's 3D filter",
-            "a PLY",
-            "Fuse the filter first (create_fused_ply.py in Mip-Splatting).",
-        )
+        found = f"a {form.name} file, which cannot hold Mip-Splatting's 3D filter"
+        remedy = "Fuse the filter first (create_fused_ply.py in Mip-Splatting)."
+        raise OutputError(new.name, found, "a PLY", remedy)
     with open(new, "wb") as file:
         try:
             form.write(file, model.to("cpu"))
@@ -160,22 +148,17 @@ def write(form: Format, new: Path, model: Model) -> None:
 
 def expect_carrier(form: Format, path: Path) -> None:
     """Raise OutputError if files of a format cannot hold thresholds and a stop."""
-    if not form.thresholds:
-        raise OutputError(
-            str(path),
-            f"a {form.name} file, which cannot hold cutoffs: its picture would be worse and "
-            "heavier than that of the pruned model",
-            "a file that holds them: " + ", ".join(_carriers()),
-            "Choose another suffix. fragprune export --no-truncation writes the model without its "
-            "cutoffs; fragprune finetune --portable learns a model that needs none.",
-        )
-
-
-def _carriers() -> list[str]:
-    """Suffixes of the formats that hold thresholds, of those that load."""
-    found = []
+    if form.thresholds:
+        return
+    carriers = []
     for suffix in SUFFIXES:
         with contextlib.suppress(PluginError):
-            if of_suffix(suffix).thresholds:
-                found.append(suffix)
-    return found
+            carriers += [suffix] if of_suffix(suffix).thresholds else []
+    raise OutputError(
+        str(path),
+        f"a {form.name} file, which cannot hold cutoffs: its picture would be worse and heavier "
+        "than that of the pruned model",
+        "a file that holds them: " + ", ".join(carriers),
+        "Choose another suffix. fragprune export --no-truncation writes the model without its "
+        "cutoffs; fragprune finetune --portable learns a model that needs none.",
+    )

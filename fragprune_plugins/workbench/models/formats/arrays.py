@@ -19,13 +19,8 @@ from fragprune_plugins.workbench.models import cutoffs
 
 Floats = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]
-
-SH_C0 = 0.28209479177387814
-"""The SH basis function of degree 0: a colour is 0.5 + SH_C0 f_dc."""
-
-SH_RESTS = (0, 3, 8, 15)
-"""How many coefficients of degree 1 and more a degree has."""
-
+SH_C0 = 0.28209479177387814  # the SH basis function of degree 0: a colour is 0.5 + SH_C0 f_dc
+SH_RESTS = (0, 3, 8, 15)  # how many coefficients of degree 1 and more a degree has
 _SCALE_MIN = 1e-30  # some writers leave 0, which has no logarithm
 _ALPHA_EDGE = 1e-6  # an 8-bit opacity of 0 or 255 has no finite logit
 
@@ -42,22 +37,15 @@ def splat_of(
     stop: float | None = None,
     rim: Rim = "hard",
 ) -> Model:
-    """A splat of arrays.
+    """A splat of arrays; ValueError without Gaussians, or for thresholds out of range.
 
     Args:
         xyz: (N, 3) means.
-        colours: (N, 3) first SH coefficients.
-        rest: (N, K - 1, 3) other coefficients.
+        colours: (N, 3) first SH coefficients; ``rest`` (N, K - 1, 3) are the others.
         opacities: (N,) in [0, 1], activated.
         log_scales: (N, 3) logarithms of standard deviations.
         rotations: (N, 4) quaternions w, x, y, z; one of length 0 becomes no rotation.
-        thresholds: (N,) in (0, 1), or None.
-        stop: as in ``RasterInputs``.
-        rim: as in ``RasterInputs``.
-
-    Raises:
-        ValueError: there are no Gaussians, or thresholds out of range.
-        InputError: the stop or the rim is out of range.
+        thresholds: (N,) in (0, 1), or None; ``stop`` and ``rim`` are those of ``RasterInputs``.
     """
     if not len(xyz):
         raise ValueError("0 Gaussians")
@@ -101,10 +89,9 @@ def of_codes(codes: Bytes) -> Tensor | None:
     """The thresholds of codes; those that cut nothing are neutral, and None if all are."""
     if not codes.any():
         return None
-    neutral = float(torch.sigmoid(torch.tensor(NEUTRAL_LOGIT)))
-    return torch.from_numpy(
-        np.where(codes == cutoffs.NEUTRAL, np.float32(neutral), cutoffs.decode(codes))
-    )
+    thresholds = torch.from_numpy(cutoffs.decode(codes))
+    thresholds[torch.from_numpy(codes == cutoffs.NEUTRAL)] = torch.tensor(NEUTRAL_LOGIT).sigmoid()
+    return thresholds
 
 
 def codes_of(splat: Model) -> Bytes | None:
@@ -181,26 +168,19 @@ def turned(splat: Model, signs: tuple[int, int, int]) -> Model:
     per_axis = torch.tensor(signs, dtype=torch.float32)
     turn = torch.tensor([1, y * z, x * z, x * y], dtype=torch.float32)
     sh = [y, z, x, x * y, y * z, 1, x * z, 1, y, x * y * z, y, z, x, z, x]
-    rest = splat.f_rest.shape[1]
-    return replace(
-        splat,
-        xyz=splat.xyz * per_axis,
-        f_rest=splat.f_rest * torch.tensor(sh[:rest], dtype=torch.float32)[None, :, None],
-        rotation=splat.rotation * turn,
-    )
+    rest = splat.f_rest * torch.tensor(sh[: splat.f_rest.shape[1]]).float()[None, :, None]
+    return replace(splat, xyz=splat.xyz * per_axis, f_rest=rest, rotation=splat.rotation * turn)
 
 
 def take(stream: Any, count: int) -> bytes:
     """Exactly so many bytes of a stream that decompresses; allocates no more than it gives."""
-    pieces: list[bytes] = []
-    missing = count
-    while missing:
-        piece: bytes = stream.read(min(missing, MEBIBYTE))
+    data = bytearray()
+    while missing := count - len(data):
+        piece = stream.read(min(missing, MEBIBYTE))
         if not piece:
-            raise EOFError(f"{count} bytes announced, {count - missing} there")
-        pieces.append(piece)
-        missing -= len(piece)
-    return b"".join(pieces)
+            raise EOFError(f"{count} bytes announced, {len(data)} there")
+        data += piece
+    return bytes(data)
 
 
 def expect_plausible(count: int, size: int) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import struct
+from itertools import chain
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -22,7 +23,6 @@ from fragprune_plugins.workbench.models.formats import Format, arrays
 BASE = "KHR_gaussian_splatting"
 CUTOFF = "FRAGPRUNE_gaussian_splatting_cutoff"
 _THRESHOLD = f"{CUTOFF}:THRESHOLD"
-
 _AXES = (-1, -1, 1)  # the PLY's to glTF's, and back
 _JSON, _BIN, _MAGIC = 0x4E4F534A, 0x004E4942, 0x46546C67
 _JSON_MAX = 16 * MEBIBYTE
@@ -82,12 +82,8 @@ def read(reading: Reading) -> Model:
 
 def _primitive(scene: dict[str, Any]) -> dict[str, Any]:
     """The one primitive of splats; it has to be where its node puts it by default."""
-    found = [
-        each
-        for mesh in scene["meshes"]
-        for each in mesh["primitives"]
-        if BASE in each.get("extensions", {})
-    ]
+    every = chain.from_iterable(mesh["primitives"] for mesh in scene["meshes"])
+    found = [each for each in every if BASE in each.get("extensions", {})]
     if len(found) != 1:
         raise ValueError(f"{len(found)} primitives of splats, where we read one")
     primitive: dict[str, Any] = found[0]
@@ -128,12 +124,8 @@ def _accessor(
 def write(file: BinaryIO, splat: Model) -> None:
     """Write one primitive; the extension is there only with thresholds or a stop."""
     splat = arrays.turned(splat, _AXES)
-    xyz, base, rest = (
-        arrays.array(splat.xyz),
-        arrays.array(splat.f_dc)[:, 0],
-        arrays.array(splat.f_rest),
-    )
-    opacity = arrays.opacities_of(splat)
+    xyz, dc, rest = map(arrays.array, (splat.xyz, splat.f_dc, splat.f_rest))
+    base, opacity = dc[:, 0], arrays.opacities_of(splat)
     rgba = arrays.byte(255 * np.column_stack([np.clip(0.5 + arrays.SH_C0 * base, 0, 1), opacity]))
     columns = {
         "POSITION": xyz,
@@ -143,12 +135,8 @@ def write(file: BinaryIO, splat: Model) -> None:
         f"{BASE}:OPACITY": opacity[:, None],
         **dict(zip(_SH, [base, *rest.transpose(1, 0, 2)], strict=False)),
     }
-    extension: dict[str, Any] = {
-        "kernel": "ellipse",
-        "colorSpace": "srgb_rec709_display",
-        "sortingMethod": "cameraDistance",
-        "projection": "perspective",
-    }
+    extension: dict[str, Any] = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    extension |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
     used = [BASE]
     if (falloff := splat.falloff) is not None:
         columns[_THRESHOLD] = arrays.array(falloff)[:, None]
@@ -157,14 +145,13 @@ def write(file: BinaryIO, splat: Model) -> None:
         used.append(CUTOFF)
     views: list[dict[str, Any]] = []
     accessors: list[dict[str, Any]] = []
-    at = 0
-    kinds = {width: name for name, width in _WIDTHS.items()}
-    for values in columns.values():
+    at, kinds = 0, {width: name for name, width in _WIDTHS.items()}
+    for number, values in enumerate(columns.values()):
         place = {"buffer": 0, "byteOffset": at, "byteLength": values.nbytes}
         views.append(place | {"target": _ARRAY_BUFFER})
         kind = _UBYTE if values.dtype == np.uint8 else _FLOAT
         rows = {"count": len(values), "type": kinds[values.shape[1]]}
-        accessors.append({"bufferView": len(accessors), "componentType": kind, **rows})
+        accessors.append({"bufferView": number, "componentType": kind, **rows})
         at += values.nbytes
     accessors[0] |= {"min": xyz.min(axis=0).tolist(), "max": xyz.max(axis=0).tolist()}
     accessors[1]["normalized"] = True

@@ -8,7 +8,6 @@ import numpy as np
 import numpy.typing as npt
 
 Floats = npt.NDArray[np.float32]
-
 _BINS = 256  # wide enough that the tails, whose levels matter, are not noise
 _ROUNDS = 20
 _EVEN = 1e-9  # squared error of a cell that need not be cut: rounding

@@ -15,15 +15,10 @@ from fragprune_plugins.files.model import Model
 
 
 def write_ply(path: Path, model: Model) -> None:
-    """Write a model atomically in the hosts' layout, with the exact values that ``read_ply`` gave.
+    """Write a model in the hosts' layout, whole or not at all, with the exact values that it has.
 
-    Args:
-        path: the file; an existing one is replaced only when the new one is complete.
-        model: the Gaussians; thresholds that cut become the last column, ``trunc_threshold``, and
-            a stop and a soft rim comments.
-
-    Raises:
-        OutputError: the file cannot be written.
+    Thresholds that cut become the last column, ``trunc_threshold``, a stop and a soft rim comments.
+    OutputError if it cannot be written.
     """
     n = len(model)
     rest = model.f_rest.transpose(1, 2).reshape(n, -1)

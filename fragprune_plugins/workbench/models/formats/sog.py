@@ -26,9 +26,7 @@ from fragprune_plugins.files.reading import MEBIBYTE, Reading, UntrustedFile, pa
 from fragprune_plugins.workbench.models.formats import Format, arrays
 from fragprune_plugins.workbench.models.formats.palette import codebook, nearest, palette
 
-EXTRA = "fragprune_cutoff"
-"""Key in ``extras``; its ``files`` names one image, whose red channel holds a code a texel."""
-
+EXTRA = "fragprune_cutoff"  # in ``extras``; its one file's red channel holds a code a texel
 _META = "meta.json"
 _META_MAX = 4 * MEBIBYTE
 _SIDE_MAX = 16383  # of a WebP

@@ -27,16 +27,9 @@ if sys.version_info >= (3, 14):
 else:
     from backports import zstd
 
-CUTOFFS = 0x46500001
-"""Type of our extension record: vendor 0x4650 (FP), extension 1. Its payload is one code for each
-Gaussian."""
-
-STOP = 0x46500002
-"""Likewise, extension 2. Its payload is the stop, float32."""
-
-SOFT = 0x46500003
-"""Likewise, extension 3, of a model with a soft rim. It has no payload."""
-
+CUTOFFS = 0x46500001  # our extension record: vendor 0x4650 (FP), 1; a code a Gaussian
+STOP = 0x46500002  # likewise 2; its payload is the stop, float32
+SOFT = 0x46500003  # likewise 3, of a model with a soft rim; no payload
 _COORDINATES = 0xADBE0003  # SPZ_ADOBE_coordinate_system
 _RDF = 6  # the PLY's axes among those that it names
 _MAGIC = 0x5053474E
@@ -81,9 +74,8 @@ def read(reading: Reading) -> Model:
     count, codes, stop = header.count, records.get(CUTOFFS), records.get(STOP)
     if codes is not None and len(codes) != count:
         raise ValueError(f"{len(codes)} thresholds for {count} Gaussians")
-    positions, alphas, colours, scales, rotations, sh = (
-        np.frombuffer(part, np.uint8).reshape(count, -1) for part in parts
-    )
+    columns = (np.frombuffer(part, np.uint8).reshape(count, -1) for part in parts)
+    positions, alphas, colours, scales, rotations, sh = columns
     b = positions.reshape(count, 3, 3).astype(np.int32)
     fixed = b[..., 0] | b[..., 1] << 8 | b[..., 2] << 16
     fixed -= (fixed & 0x800000) << 1
