@@ -33,7 +33,7 @@ from fragprune_plugins.workbench.figures.metrics import psnr, ssim
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.scenes.dataset import Shot, load_photographs
 from fragprune_plugins.workbench.scenes.generated import between, interpolate
-from fragprune_plugins.workbench.scenes.output import over_white
+from fragprune_plugins.workbench.scenes.output import arguments
 
 FAR = (-0.7, -0.3)  # of the way to a neighbour, on the other side
 EVERY = 8  # of these cameras is used
@@ -83,7 +83,8 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     engine, say = create_engine("cpu"), sys.stdout.write
-    size, white = Resolution(args.resolution), over_white(args.first)
+    size, told = Resolution(args.resolution), arguments(args.first)
+    white = told is not None and told.white_background
     dataset = load_photographs(Photographs(args.data, size, white))
     first, models = load(args.first), {str(path): load(path) for path in args.models}
     beside = elsewhere(dataset.train)

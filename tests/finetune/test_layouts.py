@@ -340,7 +340,7 @@ def test_pictures_are_kept_only_while_there_is_room():
 
     kept, slots = Pictures(room=250), [PixelSlot() for _ in range(5)]
     for number in (0, 1, 0, 2, 0, 1, 2):
-        assert int(kept.get(slots[number], loader(number))[0]) == number
+        assert int(kept.load(slots[number], loader(number))[0]) == number
         assert kept.size <= 250
     assert loads == [0, 1, 2, 2]
 
@@ -348,7 +348,7 @@ def test_pictures_are_kept_only_while_there_is_room():
 def test_a_forgotten_photograph_takes_its_pixels_along():
     kept = Pictures(room=1000)
     for _ in range(50):
-        kept.get(PixelSlot(), lambda: torch.zeros(100, dtype=torch.uint8))
+        kept.load(PixelSlot(), lambda: torch.zeros(100, dtype=torch.uint8))
     assert kept.size == 0
 
 

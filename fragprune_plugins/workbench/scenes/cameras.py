@@ -18,14 +18,8 @@ from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.files.reading import UntrustedFile
 from fragprune_plugins.hosts.photographs import Resolution
 from fragprune_plugins.types import View
-from fragprune_plugins.workbench.scenes.dataset import read_scene
-from fragprune_plugins.workbench.scenes.pinhole import Camera, focal
-from fragprune_plugins.workbench.scenes.transforms import (
-    load_json,
-    matrix,
-    opengl_pose,
-    read_transforms,
-)
+from fragprune_plugins.workbench.scenes import dataset, pinhole, transforms
+from fragprune_plugins.workbench.scenes.transforms import matrix
 
 _CAMERAS = UntrustedFile(
     DatasetError,
@@ -36,13 +30,9 @@ _CAMERAS = UntrustedFile(
 
 
 def load_cameras(path: str | Path, *, white_background: bool = False) -> list[tuple[str, View]]:
-    """Read the named views of a cameras file.
-
-    Raises:
-        DatasetError: the file is missing, broken or empty.
-    """
+    """Read the named views of a cameras file; DatasetError if it is missing, broken or empty."""
     path = Path(path)
-    content = load_json(path)
+    content = transforms.load_json(path)
     if isinstance(content, dict) and "camera_path" in content:
         with _CAMERAS.stated(path) as reading:
             if (kind := content.get("camera_type", "perspective")) != "perspective":
@@ -52,12 +42,13 @@ def load_cameras(path: str | Path, *, white_background: bool = False) -> list[tu
             for number, entry in enumerate(content["camera_path"]):
                 reading.place = f"camera_path[{number}]"
                 pose = [entry["camera_to_world"][at : at + 4] for at in (0, 4, 8)]
-                length = focal(height, math.radians(float(entry["fov"])))
+                length = pinhole.focal(height, math.radians(float(entry["fov"])))
                 lens = length, length, width / 2, height / 2
-                camera = Camera(*opengl_pose(matrix(pose, (3, 4))), width, height, *lens)
+                placed = transforms.opengl_pose(matrix(pose, (3, 4)))
+                camera = pinhole.Camera(*placed, width, height, *lens)
                 cameras.append((f"{number:05d}", camera))
     elif isinstance(content, dict):
-        cameras = [(row.name, row.camera) for row in read_transforms(path)]
+        cameras = [(row.name, row.camera) for row in transforms.read_transforms(path)]
     else:
         cameras = []
         with _CAMERAS.stated(path) as reading:
@@ -74,25 +65,23 @@ def load_scene_cameras(
     folder: Path, *, white_background: bool = False
 ) -> tuple[list[tuple[str, View]], list[tuple[str, View]]]:
     """Read the named training and held-out views of a scene folder, at their cameras' own sizes."""
-    background = torch.full((3,), float(white_background))
-    train, test = (
-        [(row.name, row.camera.view(background)) for row in part] for part in read_scene(folder)
-    )
+    background, parts = torch.full((3,), float(white_background)), dataset.read_scene(folder)
+    train, test = ([(row.name, row.camera.view(background)) for row in part] for part in parts)
     return train, test
 
 
 def sized(views: list[tuple[str, View]], size: Resolution) -> list[tuple[str, View]]:
     """The same views with pictures of the size at which photographs are read."""
-    sizes = [size.of(view.width, view.height) for _, view in views]
-    return [
-        (name, replace(view, width=width, height=height))
-        for (name, view), (width, height) in zip(views, sizes, strict=True)
-    ]
+    found = []
+    for name, view in views:
+        width, height = size.of(view.width, view.height)
+        found.append((name, replace(view, width=width, height=height)))
+    return found
 
 
-def _camera(entry: dict[str, Any]) -> Camera:
+def _camera(entry: dict[str, Any]) -> pinhole.Camera:
     rotation = matrix(entry["rotation"], (3, 3)).T.contiguous()
     position = matrix(entry["position"], (3,))
     width, height = int(entry["width"]), int(entry["height"])
     lens = float(entry["fx"]), float(entry["fy"]), width / 2, height / 2
-    return Camera(rotation, -rotation @ position, width, height, *lens)
+    return pinhole.Camera(rotation, -rotation @ position, width, height, *lens)

@@ -49,13 +49,10 @@ _MODELS = {
     12: ("SIMPLE_DIVISION", 1, 1),
     13: ("DIVISION", 2, 1),
 }
-_FOREIGN = tuple(_MODELS[number][0] for number in (7, 10, 11, 12, 13))
-"""OpenCV cannot straighten them."""
+_OPENCV = {name: n for code, (name, *n) in _MODELS.items() if code not in (7, 10, 11, 12, 13)}
+"""Those that OpenCV can straighten."""
 
-_OPENCV = {name: counts for name, *counts in _MODELS.values() if name not in _FOREIGN}
-
-Pose = tuple[str, int, tuple[float, ...], tuple[float, ...]]
-"""name, camera id, quaternion w x y z, translation"""
+Pose = tuple[str, int, tuple[float, ...], tuple[float, ...]]  # name, camera, w x y z, translation
 
 
 def find_model(folder: Path) -> Path | None:
@@ -75,10 +72,6 @@ def others(folder: Path) -> list[Path]:
     return sorted(each for each in inside if _images_file(each).exists())
 
 
-def _size(model: Path) -> int:
-    return _images_file(model).stat().st_size
-
-
 def _images_file(model: Path) -> Path:
     """A model's list of images. Binary first, as hosts do: COLMAP writes it; text is an export."""
     binary = model / "images.bin"
@@ -92,8 +85,9 @@ def read(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]
     listed = _images_file(model)
     binary = listed.suffix == ".bin"
     parsers = (_cameras_binary, _images_binary) if binary else (_cameras_text, _images_text)
-    larger = (each for each in others(folder) if _size(each) > _size(model))
-    if model == folder / "sparse" / "0" and (other := max(larger, key=_size, default=None)):
+    sizes = {each: _images_file(each).stat().st_size for each in (model, *others(folder))}
+    other = max(sizes, key=sizes.__getitem__)  # of equal ones the model
+    if model == folder / "sparse" / "0" and other != model:
         log.warning(
             "%s: reading sparse/0, as hosts do, but %s is a larger part of the scene: its "
             "photographs are not in the figures. If the model was trained on them, exchange both",
@@ -106,36 +100,22 @@ def read(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]
         for given, camera_id, quaternion, translation in parsers[1](reading):
             name = given.replace("\\", "/")  # of a model made on Windows
             if camera_id not in cameras:
-                raise DatasetError(
-                    str(model),
-                    f"image {name} of camera {camera_id}",
-                    f"one of the cameras {sorted(cameras)[:20]}",
-                    "Export images and cameras from the same COLMAP model.",
-                )
+                found = f"image {name} of camera {camera_id}"
+                expected = f"one of the cameras {sorted(cameras)[:20]}"
+                remedy = "Export images and cameras from the same COLMAP model."
+                raise DatasetError(str(model), found, expected, remedy)
             place = torch.tensor(translation, dtype=torch.float64)
-            lens = cameras[camera_id]
-            rows.append(
-                Posed(
-                    name,
-                    lens.camera(_rotation(quaternion), place),
-                    _image_path(folder / images, name),
-                    None if lens.straight else lens,
-                    _mask_path(folder / "masks", name),
-                )
-            )
+            lens, mask = cameras[camera_id], _mask_path(folder / "masks", name)
+            camera = lens.camera(_rotation(quaternion), place)
+            image = find_image(folder / images / name)
+            if not image.exists():  # hosts leave out the subfolders that a name may have
+                image = find_image(folder / images / Path(name).name)
+            rows.append(Posed(name, camera, image, None if lens.straight else lens, mask))
     return split(rows)
-
-
-def _image_path(images: Path, name: str) -> Path:
-    """The image's path, by its base name as hosts do; COLMAP's name may include subfolders."""
-    full = find_image(images / name)
-    return full if full.exists() else find_image(images / Path(name).name)
 
 
 def _mask_path(masks: Path, name: str) -> Path | None:
     """The image's mask, named as COLMAP names it (with .png at the end) or as the image."""
-    if not masks.is_dir():
-        return None
     named = masks / f"{name}.png"
     found = named if named.exists() else find_image(masks / name)
     return found if found.exists() else None
@@ -153,12 +133,8 @@ def _rotation(quaternion: tuple[float, ...]) -> Tensor:
 def _lens(model: str, width: int, height: int, values: Sequence[float]) -> Lens:
     """A lens by COLMAP's parameters of a model."""
     if model not in _OPENCV:
-        raise DatasetError(
-            "COLMAP camera",
-            f"model {model}",
-            f"one of {', '.join(_OPENCV)}",
-            "Undistort first: colmap image_undistorter.",
-        )
+        found, remedy = f"model {model}", "Undistort first: colmap image_undistorter."
+        raise DatasetError("COLMAP camera", found, f"one of {', '.join(_OPENCV)}", remedy)
     focals, bends = _OPENCV[model]
     if len(values) != focals + 2 + bends:
         raise ValueError(f"{len(values)} parameters of {model}, not {focals + 2 + bends}")

@@ -6,14 +6,14 @@ import logging
 import os
 import weakref
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
-import PIL.Image
 import torch
+from PIL import Image
 from torch import Tensor
 
 from fragprune_plugins.errors import DatasetError, printable
@@ -23,12 +23,7 @@ from fragprune_plugins.types import View, one_line
 from fragprune_plugins.workbench.scenes import colmap, transforms
 from fragprune_plugins.workbench.scenes.images import SUFFIXES, image_size, opened, turned
 from fragprune_plugins.workbench.scenes.pinhole import Camera
-from fragprune_plugins.workbench.scenes.posed import Lens, Posed
-
-if TYPE_CHECKING:
-    from PIL.Image import Image
-
-    from fragprune_plugins.workbench.scenes.posed import Pixels
+from fragprune_plugins.workbench.scenes.posed import Lens, Pixels, Posed
 
 _ASPECT_TOLERANCE = 0.01
 OFF_CENTRE = 0.5  # pixels
@@ -41,24 +36,17 @@ _LAYOUTS = (
 )
 
 log = logging.getLogger(__name__)
-
 SomeShot = TypeVar("SomeShot", bound="Shot")
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A camera, and the picture to be seen from it.
+    """A camera, and the picture to be seen from it."""
 
-    Attributes:
-        name: unique in its dataset.
-        view: the camera, with the background colour of its picture.
-        target: what the picture is: "photographs", or "itself" for the model's own.
-    """
+    target: ClassVar[str] = "photographs"  # what the picture is; "itself" for the model's own
 
-    target: ClassVar[str] = "photographs"
-
-    name: str
-    view: View
+    name: str  # unique in its dataset
+    view: View  # with the background colour of its picture
 
     __repr__ = one_line
 
@@ -78,62 +66,52 @@ class Shot:
         return replace(self, view=self.view.to(device))
 
 
-ROOM = 4096 * MEBIBYTE
-"""Bytes of pixels that are kept: 170 photographs of 3840x2160 pixels."""
+ROOM = 4096 * MEBIBYTE  # bytes of pixels that are kept: 170 photographs of 3840x2160 pixels
 
 
 class PixelSlot:
     """The place of one photograph's pixels, shared by its copies on other devices."""
 
 
-class Pictures:
-    """Pixels in slots. What came while there was room stays; what does not fit is read at each use.
-
-    Views come in random orders, in which pixels that make room for others would come back too late.
-    ``room`` is in bytes.
+class Pictures(weakref.WeakKeyDictionary[PixelSlot, Tensor]):
+    """Pixels in slots. What came while there was room (bytes) stays; the rest is read at each use:
+    views come in random orders, in which pixels that make room would come back too late.
     """
 
     def __init__(self, room: int) -> None:
+        super().__init__()
         self.room = room
-        self._held: weakref.WeakKeyDictionary[PixelSlot, Tensor] = weakref.WeakKeyDictionary()
 
     @property
     def size(self) -> int:
         """Bytes of all pixels that are kept."""
-        return sum(pixels.numel() for pixels in self._held.values())
+        return sum(pixels.numel() for pixels in self.values())
 
-    def get(self, slot: PixelSlot, load: Callable[[], Tensor]) -> Tensor:
-        """The slot's pixels, loaded if they are not there."""
-        known = self._held.get(slot)
-        if known is None:
-            known = load()
+    def load(self, slot: PixelSlot, read: Callable[[], Tensor]) -> Tensor:
+        """The slot's pixels, read if they are not there."""
+        if (known := self.get(slot)) is None:
+            known = read()
             if self.size + known.numel() <= self.room:
-                self._held[slot] = known
+                self[slot] = known
         return known
 
 
-PICTURES = Pictures(ROOM)
-"""Of the whole process."""
+PICTURES = Pictures(ROOM)  # of the whole process
 
 
 @dataclass(frozen=True, eq=False)
 class Photograph(Shot):
     """One photograph with its camera; RGB in [0, 1], composited over the view's background.
 
-    Attributes:
-        path: the image file. It is read at first use, and kept in main memory at 8 bits a channel
-            as long as there is room: a scene's photographs may be larger than any memory.
-        camera: of the whole photograph, straightened; None if ``lens`` is.
-        lens: what bends the photograph; None if it is straight.
-        mask: an image of the same aspect. The photograph is black where this is.
-        opaque: an alpha channel counts for nothing; the colours stay as they are under it.
+    The file is read at first use, and kept in main memory at 8 bits a channel as long as there is
+    room: a scene's photographs may be larger than any memory.
     """
 
     path: Path
-    camera: Camera | None = None
-    lens: Lens | None = None
-    mask: Path | None = None
-    opaque: bool = False
+    camera: Camera | None = None  # of the whole photograph, straightened; None if ``lens`` is
+    lens: Lens | None = None  # what bends the photograph; None if it is straight
+    mask: Path | None = None  # an image of the same aspect; the photograph is black where this is
+    opaque: bool = False  # an alpha channel counts for nothing; the colours stay under it
     _pixels: PixelSlot = field(default_factory=PixelSlot, repr=False)
 
     __repr__ = one_line
@@ -166,38 +144,34 @@ class Photograph(Shot):
 
     def _read(self) -> Tensor:
         """(H, W, 3) uint8, or 4 with a mask, on the view's device."""
-        return PICTURES.get(self._pixels, self._load).to(self.view.background.device)
+        return PICTURES.load(self._pixels, self._load).to(self.view.background.device)
 
     def _load(self) -> Tensor:
-        size = (self.view.width, self.view.height)
         with opened(self.path) as file:
             whole = file.size
-            mode = "RGBA" if file.has_transparency_data else "RGB"
-            picture = self._fitted(file.convert(mode), size)
+            picture = self._fitted(file.convert("RGBA" if file.has_transparency_data else "RGB"))
         behind = 255 * self.view.background.cpu().numpy()
         flat = picture[..., :3].copy() if self.opaque else _over(picture, behind)
         if self.mask is not None:
             with opened(self.mask) as file:
                 _expect_aspect(self.mask, file.size, "its photograph", whole)
-                levels = self._fitted(file.convert("RGBA").convert("LA"), size)
+                levels = self._fitted(file.convert("RGBA").convert("LA"))
             seen = levels.min(axis=2) >= _SEEN  # what is transparent is black
             if not seen.any():
-                raise DatasetError(
-                    str(self.mask),
-                    f"a mask that is black everywhere: grey levels end at {levels.min(2).max()}",
-                    f"some of the photograph to look at, from {_SEEN} on",
-                    "Remove the view, or turn the mask over.",
-                )
+                found = f"a mask that is black everywhere: grey levels end at {levels.min(2).max()}"
+                expected = f"some of the photograph to look at, from {_SEEN} on"
+                remedy = "Remove the view, or turn the mask over."
+                raise DatasetError(str(self.mask), found, expected, remedy)
             shown = seen[..., None].astype(np.uint8)
             flat = np.concatenate([flat * shown, shown], axis=2)
         return torch.from_numpy(flat)
 
-    def _fitted(self, picture: Image, size: tuple[int, int]) -> Pixels:
+    def _fitted(self, picture: Image.Image) -> Pixels:
         """The pixels of a picture, straightened and of the view's size."""
         if self.lens is not None:
             assert self.camera is not None
-            straight = self.lens.straighten(np.asarray(picture), self.camera)
-            picture = PIL.Image.fromarray(straight)
+            picture = Image.fromarray(self.lens.straighten(np.asarray(picture), self.camera))
+        size = (self.view.width, self.view.height)
         return np.array(picture if picture.size == size else picture.resize(size))
 
 
@@ -322,7 +296,13 @@ def load_dataset(
             "output folder, with cfg_args, or finetune made them",
             *(printable(str(folder)), off),
         )
-    _warn_of_turned(row.image for part in rows for row in part)
+    if lying := [row.image for part in rows for row in part if turned(row.image)]:
+        log.warning(
+            "%d of the photographs, such as %s, have an EXIF orientation. Their pixels are read as "
+            "they are stored, as COLMAP and hosts read them. If the program that found the cameras "
+            "turned them, turn their pixels, too (exiftran -ai)",
+            *(len(lying), printable(str(lying[0]))),
+        )
     if dataset.leaked:
         log.warning(
             "%s: %d of the %d held-out views are training views too, so figures on them flatter: "
@@ -330,16 +310,6 @@ def load_dataset(
             *(printable(str(folder)), dataset.leaked, len(test)),
         )
     return dataset
-
-
-def _warn_of_turned(images: Iterable[Path]) -> None:
-    if lying := [image for image in images if turned(image)]:
-        log.warning(
-            "%d of the photographs, such as %s, have an EXIF orientation. Their pixels are read as "
-            "they are stored, as COLMAP and hosts read them. If the program that found the cameras "
-            "turned them, turn their pixels, too (exiftran -ai)",
-            *(len(lying), printable(str(lying[0]))),
-        )
 
 
 def read_scene(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]]:
@@ -360,16 +330,14 @@ def read_scene(folder: Path, images: str = "images") -> tuple[list[Posed], list[
         raise DatasetError(str(folder), found, _LAYOUTS, "Move one aside.")
     if model is None and not known:
         raise DatasetError(str(folder), "neither layout", _LAYOUTS, _where_else(folder))
-    images = _image_folder(folder, images)
-    train, test = (transforms if known else colmap).read(folder, images)
+    train, test = (transforms if known else colmap).read(folder, _image_folder(folder, images))
     for name, part in (("training", train), ("held-out", test)):
         if not part:
-            raise DatasetError(
-                str(folder),
-                f"no {name} view ({len(train) + len(test)} in all)",
-                "at least one training and one held-out view",
-                "Add photographs; every 8th is held out, unless the scene lists others by name.",
-            )
+            found = f"no {name} view ({len(train) + len(test)} in all)"
+            expected = "at least one training and one held-out view"
+            held = "every 8th is held out, unless the scene lists others by name"
+            remedy = f"Add photographs; {held}."
+            raise DatasetError(str(folder), found, expected, remedy)
     return train, test
 
 
@@ -417,9 +385,6 @@ def _expect_aspect(
     if abs(width * high - height * wide) > max(_ASPECT_TOLERANCE * height * wide, rounded):
         lying = abs(width * wide / (height * high) - 1) <= _ASPECT_TOLERANCE
         remedy = "Turn its pixels as its EXIF orientation says (exiftran -ai). " if lying else ""
-        raise DatasetError(
-            str(path),
-            f"{width}x{height} pixels",
-            f"those of {whose}, {wide}x{high}, or that aspect",
-            remedy + "Use the images that the cameras were calibrated with.",
-        )
+        remedy += "Use the images that the cameras were calibrated with."
+        fits = f"those of {whose}, {wide}x{high}, or that aspect"
+        raise DatasetError(str(path), f"{width}x{height} pixels", fits, remedy)

@@ -12,7 +12,7 @@ import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from scipy.spatial.transform import Rotation
@@ -25,16 +25,10 @@ from fragprune_plugins.files.model import Model
 from fragprune_plugins.plugins.hooks import drawn_by, engine_for
 from fragprune_plugins.types import RasterInputs, View, one_line
 from fragprune_plugins.workbench.models import model as models
-from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
-from fragprune_plugins.workbench.scenes.pinhole import look_at
-from fragprune_plugins.workbench.scenes.posed import hold_out
+from fragprune_plugins.workbench.scenes import dataset, pinhole, posed
 
-Named = list[tuple[str, View]]
-"""Names of views, and the views."""
-
-ORBIT_VIEWS = 96
-"""Cameras that ``around`` gives by default."""
-
+Named = list[tuple[str, View]]  # names of views, and the views
+ORBIT_VIEWS = 96  # cameras that ``around`` gives by default
 _SHOWN = 0.9  # share of the Gaussians that an orbit goes around: some float far out
 _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 _NEARER = (0.6, 1.0)  # of the distance that shows them all: viewers zoom
@@ -83,13 +77,13 @@ def around(
     """
     stream = random.Random(seed)
     centre, radius = bounds(splat)
+    square: dict[str, Any] = {"width": pixels, "height": pixels, "background": background}
     views = []
     for number in range(count):
         far = radius / math.sin(math.radians(_FOV) / 2) * stream.uniform(*_NEARER)
         far, fov = not_too_near(far, radius, _FOV)
         eye = centre + far * _direction(number, count)
-        view = look_at(eye, centre, width=pixels, height=pixels, fov_y=fov, background=background)
-        views.append((f"around{number:03d}", view))
+        views.append((f"around{number:03d}", pinhole.look_at(eye, centre, fov_y=fov, **square)))
     return views
 
 
@@ -99,7 +93,7 @@ def within(places: Sequence[Tensor], count: int, *, pixels: int = 800) -> Named:
     for number in range(count):
         eye = places[number % len(places)].detach().float().cpu()
         ahead = eye + _direction(number, count, _LEVEL)
-        view = look_at(eye, ahead, width=pixels, height=pixels, fov_y=_WIDE)
+        view = pinhole.look_at(eye, ahead, width=pixels, height=pixels, fov_y=_WIDE)
         views.append((f"within{number:03d}", view))
     return views
 
@@ -112,10 +106,7 @@ def _direction(number: int, count: int, steepest: float = 1.0) -> Tensor:
 
 
 def between(cameras: Named, *, seed: int = 0) -> Named:
-    """Cameras between each given one and those near it, in place and in what they look at.
-
-    There are up to four for each camera: none towards one that looks more than a quarter turn away.
-    """
+    """Cameras between each given one and up to four near it, in place and in what they look at."""
     stream = random.Random(seed)
     return [
         (f"{name}~{cameras[j][0]}", interpolate(view, cameras[j][1], stream.uniform(*_BETWEEN)))
@@ -125,10 +116,7 @@ def between(cameras: Named, *, seed: int = 0) -> Named:
 
 
 def beside(cameras: Named, count: int, *, seed: int = 0) -> Named:
-    """Cameras next to given ones, in turns: on the way to one nearby, or on the way away from it.
-
-    There are none if no two of the given ones look the same way.
-    """
+    """Cameras next to given ones, in turns, on the way to one nearby or away from it, if any is."""
     stream, found = random.Random(seed), []
     near = [(i, others) for i, others in enumerate(_neighbours(cameras)) if others]
     for turn in range(count if near else 0):
@@ -139,12 +127,10 @@ def beside(cameras: Named, count: int, *, seed: int = 0) -> Named:
     return found
 
 
-def views_near(shots: Sequence[Shot], *, seed: int = 0) -> list[View]:
-    """The views of photographs, and five beside each of them: what a visitor may see.
+def views_near(shots: Sequence[dataset.Shot], *, seed: int = 0) -> list[View]:
+    """The views of photographs, on one device, and five beside each: what a visitor may see.
 
-    Args:
-        shots: the photographs, on one device.
-        seed: of the cameras beside theirs; none if no two photographs look the same way.
+    There are none beside them if no two photographs look the same way.
     """
     named = [(shot.name, shot.view) for shot in shots]
     return [view for _, view in (*named, *beside(named, _ASIDE * len(named), seed=seed))]
@@ -187,26 +173,21 @@ def moved(view: View, viewmatrix: Tensor, campos: Tensor) -> View:
     """The view with its lens and picture, from where another pose is."""
     lens = torch.linalg.solve(view.viewmatrix.double(), view.projmatrix.double())  # camera to clip
     matrix = viewmatrix.to(lens)
-    return replace(
-        view,
-        viewmatrix=matrix.to(view.viewmatrix),
-        projmatrix=(matrix @ lens).to(view.projmatrix),
-        campos=campos.to(view.campos),
-    )
+    pose, seen = matrix.to(view.viewmatrix), (matrix @ lens).to(view.projmatrix)
+    return replace(view, viewmatrix=pose, projmatrix=seen, campos=campos.to(view.campos))
 
 
 @dataclass(frozen=True, eq=False)
-class OwnPicture(Shot):
+class OwnPicture(dataset.Shot):
     """A camera, and the picture that a model gives there.
 
-    Attributes:
-        draw: draws it, (3, H, W). It is asked at every use: a forward pass more in a step costs
-            less than to hold the pictures of hundreds of views, and rounds nothing.
+    It is drawn at every use: a forward pass more in a step costs less than to hold the pictures of
+    hundreds of views, and rounds nothing.
     """
 
     target: ClassVar[str] = "itself"
 
-    draw: Callable[[View], Tensor]
+    draw: Callable[[View], Tensor]  # (3, H, W)
 
     __repr__ = one_line
 
@@ -223,7 +204,7 @@ def own_pictures(
     *,
     engine: str | Engine = "auto",
     seed: int = 0,
-) -> Dataset:
+) -> dataset.Dataset:
     """A model's own pictures, to learn its thresholds from without photographs.
 
     It is drawn as it came in: untruncated, or truncated by the thresholds that it has.
@@ -253,9 +234,7 @@ def own_pictures(
         if len(views) < 2:
             expected = "at least two: the first of each eight is held out for the figures"
             raise DatasetError("cameras", f"{len(views)}", expected, "Pass more cameras.")
-        views, held_out = hold_out(views)
-    train, test = (
-        [OwnPicture(name, view, draw) for name, view in part]
-        for part in ([*views, *between(views, seed=seed)], held_out)
-    )
-    return Dataset(train, test).to(model.device)
+        views, held_out = posed.hold_out(views)
+    parts = ([*views, *between(views, seed=seed)], held_out)
+    train, test = ([OwnPicture(name, view, draw) for name, view in part] for part in parts)
+    return dataset.Dataset(train, test).to(model.device)

@@ -14,16 +14,10 @@ from fragprune_plugins.constants import SIDE_MAX
 from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.files.reading import UntrustedFile
 
-PIXELS_MAX = 160_000_000
-"""Most pixels of a photograph; cameras reach 151 million. Pillow itself refuses 179 million."""
-
-_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
-"""All that Pillow may take a file for. Some of its other readers run programs."""
-
+PIXELS_MAX = 160_000_000  # cameras reach 151 million; Pillow itself refuses 179 million
+_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")  # some of Pillow's other readers run programs
 _ORIENTATION = 0x0112  # of EXIF
-
-_CUT = ("I", "F")
-"""Modes besides 16-bit grey whose values Pillow cuts at 255: a bright photograph is white then."""
+_CUT = ("I", "F")  # modes beside 16-bit grey whose values Pillow cuts at 255: bright is white
 
 IMAGE_FILE = UntrustedFile(
     DatasetError,
@@ -34,16 +28,14 @@ IMAGE_FILE = UntrustedFile(
     noun="image",
 )
 
-
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 
 
 def find_image(path: Path) -> Path:
     """The image file that a scene lists: the path, or one of its folder and stem.
 
-    Scenes list images without a suffix (Blender's), or with that of the images before they were
-    made smaller or renamed (.JPG, .png), or in another case, which other systems do not tell apart.
-    If there is no file, or more than one, it is the path.
+    Scenes list images without a suffix (Blender's), or with that of before they were made smaller
+    or renamed, or in another case. If there is no file, or more than one, it is the path.
     """
     if path.is_file():
         return path
@@ -63,8 +55,7 @@ def find_image(path: Path) -> Path:
 def opened(path: Path) -> Iterator[Image.Image]:
     """Open an image for the length of a block; its pixels are read on use.
 
-    Raises:
-        DatasetError: the file is missing, no image, or too large; or the block raised.
+    A file that is missing, no image or too large is a DatasetError, and what the block raises.
     """
     with IMAGE_FILE.reading(path) as reading, warnings.catch_warnings():
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # PIXELS_MAX decides

@@ -11,6 +11,7 @@ import contextlib
 import logging
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,8 @@ from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.hosts.source import parsed
 
 ARGUMENTS, CAMERAS = "cfg_args", "cameras.json"
-
 _DIVISORS = (1, 2, 4, 8)  # of -r; other numbers are widths
-_LATE = "train_test_exp"
-"""An argument of 3DGS since October 2024, which drops the alpha of Blender's images, too."""
+_LATE = "train_test_exp"  # of 3DGS since October 2024, which drops Blender's alpha, too
 _READ = ("source_path", "images", "resolution", "white_background", "eval", _LATE)
 
 _FILE = UntrustedFile(
@@ -41,19 +40,13 @@ def newest_model(folder: Path) -> Path:
     """The PLY of the highest iteration in an output folder, or in the only one of a folder's."""
     outputs = {each.parent for each in folder.glob("*/point_cloud")}
     one = len(outputs) == 1 and not (folder / "point_cloud").exists()
-    inside = outputs.pop() if one else folder
-    found = [
-        (int(number[1]), path)
-        for path in inside.glob("point_cloud/iteration_*/point_cloud.ply")
-        if (number := re.fullmatch(r"iteration_(\d{1,9})", path.parent.name))
-    ]
+    plys = (outputs.pop() if one else folder).glob("point_cloud/iteration_*/point_cloud.ply")
+    numbers = ((re.fullmatch(r"iteration_(\d{1,9})", ply.parent.name), ply) for ply in plys)
+    found = [(int(number[1]), ply) for number, ply in numbers if number]
     if not found:
-        raise ModelFileError(
-            str(folder),
-            "a folder without point_cloud/iteration_*/point_cloud.ply",
-            "a model, or the output folder of a training",
-            "Pass the model's file.",
-        )
+        missing = "a folder without point_cloud/iteration_*/point_cloud.ply"
+        expected = "a model, or the output folder of a training"
+        raise ModelFileError(str(folder), missing, expected, "Pass the model's file.")
     return max(found)[1]
 
 
@@ -73,72 +66,51 @@ def cameras_of(model: Path) -> Path | None:
 def trained_on(model: Path) -> Photographs | None:
     """The photographs of a model's training, by the arguments in its output folder; else None.
 
-    A training without ``--eval`` held no view out, which is warned of. Arguments that cannot
-    be read are a DatasetError.
+    Without ``--eval`` it held no view out, which is warned of. Broken ones are a DatasetError.
     """
     if (known := _arguments(model)) is None:
         return None
-    if not known[1]:
-        log.warning(
-            "%s was trained without --eval: it has seen the held-out views, so figures on them "
-            "flatter it",
-            printable(str(output_folder(model))),
-        )
-    return known[0]
-
-
-def saw_all(model: Path) -> bool:
-    """Whether the training of a model, by the arguments in its output folder, held no view out."""
-    known = _legible(model)
-    return bool(known and not known[1])
+    if not known.held_out:
+        why = "it has seen the held-out views, so figures on them flatter it"
+        folder = printable(str(output_folder(model)))
+        log.warning("%s was trained without --eval: %s", folder, why)
+    return replace(known, held_out=True)
 
 
 def read_otherwise(model: Path, now: Photographs) -> list[str]:
     """Arguments by which the training of a model read its photographs otherwise."""
-    then, held_out = _legible(model) or (now, now.held_out)
+    then = arguments(model) or now
     names = ("images", "resolution", "white_background")
     other = [name for name in names if getattr(then, name) != getattr(now, name)]
-    return other + ["eval"] * (held_out and not now.held_out)
+    return other + ["eval"] * (then.held_out and not now.held_out)
 
 
-def over_white(model: Path) -> bool:
-    """Whether the training of a model, by the arguments in its output folder, drew over white."""
-    known = _legible(model)
-    return bool(known and known[0].white_background)
-
-
-def trained_size(model: Path) -> Resolution:
-    """The size at which the training of a model read its photographs, as far as is known."""
-    known = _legible(model)
-    return known[0].resolution if known else Resolution()
-
-
-def _legible(model: Path) -> tuple[Photographs, bool] | None:
-    """What ``_arguments`` gives; None also where they cannot be read."""
+def arguments(model: Path) -> Photographs | None:
+    """The photographs of a model's training, and whether it held views out; None if not known."""
     with contextlib.suppress(DatasetError):
         return _arguments(model)
     return None
 
 
-def _arguments(model: Path) -> tuple[Photographs, bool] | None:
-    """The photographs of a model's training, and whether it held views out; None if not known."""
+def _arguments(model: Path) -> Photographs | None:
+    """The same; DatasetError where they cannot be read."""
     folder = output_folder(model)
     if folder is None or not (folder / ARGUMENTS).exists():
         return None
     with _FILE.reading(folder / ARGUMENTS) as reading:
         tree = parsed(reading.text().strip())
         match tree.body if tree else []:
-            case [ast.Expr(value=ast.Call(func=ast.Name(id="Namespace")) as call)]:
+            case [ast.Expr(value=ast.Call(func=ast.Name(id="Namespace"), keywords=words))]:
                 pass
             case _:
                 raise ValueError("no Namespace(...)")
         values: dict[str, Any] = {}
-        for word in call.keywords:
+        for word in words:
             if word.arg in _READ:
                 reading.place = word.arg
                 values[word.arg] = ast.literal_eval(word.value)
         reading.place = ""
-        return told_by(values), bool(values.get("eval", False))
+        return replace(told_by(values), held_out=bool(values.get("eval", False)))
 
 
 def told_by(values: Mapping[str, Any]) -> Photographs:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import torch
 from torch import Tensor
@@ -13,29 +13,20 @@ from torch import Tensor
 from fragprune_plugins.errors import InputError
 from fragprune_plugins.types import View, check_lens, check_tensor, one_line
 
-ROTATION_TOLERANCE: Final = 1e-2
-"""Most that R R^T of a camera's rotation differs from 1; matrices come rounded to a few digits."""
-
-DISTANCE_MAX: Final = 1e12
-"""Most world units of a camera from the origin: float32 holds its square with room to spare."""
+ROTATION_TOLERANCE: Final = 1e-2  # of R R^T from 1: matrices come rounded to a few digits
+DISTANCE_MAX: Final = 1e12  # world units from the origin: float32 holds its square
 
 
 @dataclass(frozen=True)
 class Camera:
     """A pinhole camera and its pose; construction checks that they are plausible.
 
-    Every reader of cameras makes these, so this is where geometry is checked.
-
-    Attributes:
-        rotation: (3, 3) float64, world to camera (x right, y down, z forward).
-        translation: (3,) float64.
-        width, height: pixels.
-        fx, fy: focal lengths, pixels.
-        cx, cy: principal point, pixels; width / 2 is the centre.
+    Every reader of cameras makes these, so this is where geometry is checked. Sides, focal lengths
+    and the principal point, width / 2 of which is the centre, are in pixels.
     """
 
-    rotation: Tensor
-    translation: Tensor
+    rotation: Tensor  # (3, 3) float64, world to camera (x right, y down, z forward)
+    translation: Tensor  # (3,) float64
     width: int
     height: int
     fx: float
@@ -62,14 +53,10 @@ class Camera:
 
     def view(self, background: Tensor | None = None) -> View:
         """The camera as a view for engines, computed in float64, float32 in the result."""
-        exact = View.pinhole(**vars(self))
-        return replace(
-            exact,
-            viewmatrix=exact.viewmatrix.float(),
-            projmatrix=exact.projmatrix.float(),
-            campos=exact.campos.float(),
-            background=torch.zeros(3) if background is None else background,
-        )
+        exact, pose = View.pinhole(**vars(self)), ("viewmatrix", "projmatrix", "campos")
+        single = {name: getattr(exact, name).float() for name in pose}
+        behind = torch.zeros(3) if background is None else background
+        return replace(exact, background=behind, **single)
 
 
 def focal(side: float, angle: float) -> float:
@@ -109,14 +96,12 @@ def look_at(
         eye: (3,) camera centre in the world.
         target: (3,) what is in the middle of the picture.
         up: (3,) what is up in the picture, of any length; COLMAP's worlds have y down.
-        width: pixels.
-        height: pixels.
+        width, height: pixels.
         fov_y: vertical field of view, degrees in (0, 180).
         background: (3,) RGB; black when None.
 
     Raises:
-        InputError: eye equals target, it looks straight up or down, or fov_y is not in
-            (0, 180).
+        InputError: eye equals target, it looks straight up or down, or fov_y is out of range.
     """
     at, to, over = (torch.as_tensor(p, dtype=torch.float64).cpu() for p in (eye, target, up))
     for name, point in (("eye", at), ("target", to), ("up", over)):
@@ -125,22 +110,13 @@ def look_at(
     right = torch.linalg.cross(forward, over)
     straight = float(right.norm()) > 1e-6 * float(over.norm())  # False for NaN, too
     if not straight or not 0 < fov_y < 180:
-        raise InputError(
-            "look_at",
-            f"eye {at.tolist()}, target {to.tolist()}, up {over.tolist()}, fov_y {fov_y:g}",
-            "a target apart from the eye, up not along the way there, and fov_y in (0, 180)",
-            "Move one of them.",
-        )
+        found = f"eye {at.tolist()}, target {to.tolist()}, up {over.tolist()}, fov_y {fov_y:g}"
+        expected = "a target apart from the eye, up not along the way there, and fov_y in (0, 180)"
+        raise InputError("look_at", found, expected, "Move one of them.")
     right = torch.nn.functional.normalize(right, dim=0)
     rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
     length = focal(height, math.radians(fov_y))
+    lens: dict[str, Any] = {"width": width, "height": height, "fx": length, "fy": length}
     with torch.autocast("cpu", enabled=False):  # it would turn the camera, by its three digits
-        return View.pinhole(
-            rotation.float(),
-            (-rotation @ at).float(),
-            width=width,
-            height=height,
-            fx=length,
-            fy=length,
-            background=background,
-        )
+        pose = rotation.float(), (-rotation @ at).float()
+        return View.pinhole(*pose, background=background, **lens)

@@ -8,47 +8,33 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
 
 from fragprune_plugins.errors import DatasetError, log
 from fragprune_plugins.workbench.scenes.pinhole import Camera
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    Pixels = np.ndarray[Any, np.dtype[np.uint8]]
-
-
+Pixels = NDArray[np.uint8]
 Item = TypeVar("Item")
-
-HOLD_OUT = 8
-"""Views 0, 8, 16, ... of the sorted names are held out (hosts' llffhold)."""
-
+HOLD_OUT = 8  # views 0, 8, 16, ... of the sorted names are held out (hosts' llffhold)
 _COEFFICIENTS_MAX = 1e3  # of a real lens they are below 1
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A lens by OpenCV's models, in COLMAP's pixel convention.
+    """A lens by OpenCV's models, in COLMAP's pixels: 0.5 is the middle of the first one."""
 
-    Attributes:
-        width, height: pixels of the photograph that the numbers belong to.
-        fx, fy: focal lengths, pixels.
-        cx, cy: principal point, pixels; 0.5 is the middle of the first pixel.
-        coefficients: k1, k2, p1, p2, k3, k4, k5, k6; of a fisheye k1, k2, k3, k4.
-        fisheye: whether the model is OpenCV's (and COLMAP's) fisheye.
-    """
-
-    width: int
+    width: int  # of the photograph that the numbers belong to
     height: int
     fx: float
     fy: float
     cx: float
     cy: float
-    coefficients: tuple[float, ...]
-    fisheye: bool = False
+    coefficients: tuple[float, ...]  # k1, k2, p1, p2, k3, k4, k5, k6; of a fisheye k1, k2, k3, k4
+    fisheye: bool = False  # whether the model is OpenCV's (and COLMAP's) fisheye
 
     def __post_init__(self) -> None:
         if len(self.coefficients) != (4 if self.fisheye else 8):
@@ -72,9 +58,8 @@ class Lens:
         cv2, size = _opencv(), (self.width, self.height)
         matrix, bend = _matrix(own), np.array(self.coefficients)
         if self.fisheye:
-            found = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
-                matrix, bend, size, np.eye(3), balance=0.0
-            )
+            estimate = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify
+            found = estimate(matrix, bend, size, np.eye(3), balance=0.0)
         else:
             found, _ = cv2.getOptimalNewCameraMatrix(matrix, bend, size, alpha=0)
         fx, fy, cx, cy = (float(found[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
@@ -86,10 +71,7 @@ class Lens:
         return Camera(rotation, translation, *numbers)
 
     def straighten(self, pixels: Pixels, camera: Camera) -> Pixels:
-        """A photograph (H, W, channels), of any size with the lens's aspect, as ``camera`` sees it.
-
-        The latter is what the method of that name gave, of any size with that aspect.
-        """
+        """A photograph (H, W, channels), of any size with its aspect, as ``camera`` sees it."""
         cv2 = _opencv()
         height, width = pixels.shape[:2]
         seen = _matrix(camera.resized(width, height))
@@ -97,49 +79,37 @@ class Lens:
         make = cv2.fisheye.initUndistortRectifyMap if self.fisheye else cv2.initUndistortRectifyMap
         bend, size = np.array(self.coefficients), (width, height)
         maps = make(_matrix(here), bend, np.eye(3), seen, size, cv2.CV_32FC1)
-        straight: Pixels = cv2.remap(
-            pixels, *maps, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
+        edge = cv2.BORDER_REPLICATE
+        straight: Pixels = cv2.remap(pixels, *maps, cv2.INTER_LINEAR, borderMode=edge)
         return straight.reshape(pixels.shape)
 
 
 def _matrix(camera: Camera) -> np.ndarray[Any, Any]:
     """Intrinsics as OpenCV has them, where 0 is the middle of the first pixel."""
-    return np.array(
-        [[camera.fx, 0.0, camera.cx - 0.5], [0.0, camera.fy, camera.cy - 0.5], [0.0, 0.0, 1.0]]
-    )
+    x, y = camera.cx - 0.5, camera.cy - 0.5
+    return np.array([[camera.fx, 0.0, x], [0.0, camera.fy, y], [0.0, 0.0, 1.0]])
 
 
 def _opencv() -> Any:
     try:
         import cv2
     except ImportError as error:
-        raise DatasetError(
-            "lens",
-            "lens distortion, and OpenCV is not installed",
-            "undistorted images, or OpenCV to undistort them",
-            "pip install 'fragprune-plugins[undistort]', or undistort them first "
-            "(colmap image_undistorter).",
-        ) from error
+        found = "lens distortion, and OpenCV is not installed"
+        expected = "undistorted images, or OpenCV to undistort them"
+        first = "or undistort them first (colmap image_undistorter)."
+        remedy = f"pip install 'fragprune-plugins[undistort]', {first}"
+        raise DatasetError("lens", found, expected, remedy) from error
     return cv2
 
 
 class Posed(NamedTuple):
-    """A photograph that a scene lists, before any of its pixels is read.
+    """A photograph that a scene lists, before any of its pixels is read."""
 
-    Attributes:
-        name: unique in the scene.
-        camera: of the straightened photograph.
-        image: the file.
-        lens: what straightens it; None if it is straight.
-        mask: a picture of the same aspect, black where the photograph is to be ignored.
-    """
-
-    name: str
-    camera: Camera
+    name: str  # unique in the scene
+    camera: Camera  # of the straightened photograph
     image: Path
-    lens: Lens | None = None
-    mask: Path | None = None
+    lens: Lens | None = None  # what straightens it; None if it is straight
+    mask: Path | None = None  # of the same aspect, black where the photograph is to be ignored
 
 
 def hold_out(items: Sequence[Item]) -> tuple[list[Item], list[Item]]:

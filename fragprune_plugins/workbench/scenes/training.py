@@ -14,15 +14,12 @@ from fragprune_plugins.files.reading import UntrustedFile
 from fragprune_plugins.types import View
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
 from fragprune_plugins.workbench.scenes.dataset import Dataset
-from fragprune_plugins.workbench.scenes.output import cameras_of, output_folder, saw_all
+from fragprune_plugins.workbench.scenes.output import arguments, cameras_of, output_folder
 from fragprune_plugins.workbench.scenes.transforms import matrix
 
 log = logging.getLogger(__name__)
-
-_FAR = 0.01
-"""Of the cameras' extent, or of a turn in radians: other worlds are further, files round less."""
-_NEUTRAL = 1e-3
-"""Of exposures: a change that no 8-bit level shows."""
+_FAR = 0.01  # of the cameras' extent, or radians: other worlds are further, files round less
+_NEUTRAL = 1e-3  # of exposures: a change that no 8-bit level shows
 
 _EXPOSURES = UntrustedFile(
     DatasetError,
@@ -36,10 +33,10 @@ def saw_held_out(model: Path, dataset: Dataset) -> bool:
     """Whether the training of a model saw views that are held out here, as far as it can be known.
 
     They are training photographs too, or it held none out by its arguments; or its cameras.json, in
-    which hosts list first what they hold out, begins with others or has these among the others
-    too, which is warned of.
+    which hosts list first what they hold out, says so, which is warned of.
     """
-    if dataset.leaked or saw_all(model):
+    told = arguments(model)
+    if dataset.leaked or (told and not told.held_out):
         return True
     listed = [name for name, _ in _listed(model)]
     train, held = (Counter(_base(s.name) for s in each) for each in (dataset.train, dataset.test))
@@ -56,15 +53,11 @@ def saw_held_out(model: Path, dataset: Dataset) -> bool:
 
 
 def moved(model: Path, dataset: Dataset) -> str:
-    """The name of a photograph whose camera was elsewhere in the training of a model; "" if none.
-
-    Its codebase may turn or scale the world, or move cameras, after it reads them.
-    """
+    """The name of a photograph whose camera was elsewhere in a model's training; "" if none."""
     listed, extent = _listed(model), dataset.extent
     known = {} if len(dict(listed)) < len(listed) else dict(listed)  # as in Blender's layout
     for shot in (*dataset.train, *dataset.test):
-        was = known.get(_base(shot.name))
-        if was is not None:
+        if was := known.get(_base(shot.name)):
             turned = (was.viewmatrix - shot.view.viewmatrix.cpu())[:3, :3].norm()
             far = (was.campos - shot.view.campos.cpu()).norm()
             if turned > _FAR or far > _FAR * extent:
@@ -80,13 +73,12 @@ def exposed(model: Path) -> str:
     """
     folder = output_folder(model)
     path = folder / "exposure.json" if folder else None
-    if path is None or not path.is_file():
-        return ""
-    with _EXPOSURES.reading(path) as reading:
-        for name, rows in reading.json().items():
-            reading.place = name
-            if (matrix(rows, (3, 4)) - torch.eye(3, 4)).abs().max() > _NEUTRAL:
-                return str(name)
+    if path and path.is_file():
+        with _EXPOSURES.reading(path) as reading:
+            for name, rows in reading.json().items():
+                reading.place = name
+                if (matrix(rows, (3, 4)) - torch.eye(3, 4)).abs().max() > _NEUTRAL:
+                    return str(name)
     return ""
 
 

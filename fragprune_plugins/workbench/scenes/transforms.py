@@ -14,18 +14,12 @@ from fragprune_plugins.workbench.scenes.pinhole import focal
 from fragprune_plugins.workbench.scenes.posed import Lens, Posed, split
 
 PAIR = ("transforms_train.json", "transforms_test.json")
-VALIDATION = "transforms_val.json"
-"""Stands for the second of them where that is not there."""
-
+VALIDATION = "transforms_val.json"  # stands for the second of them where that is not there
 SINGLE = "transforms.json"
-
 _PINHOLES = ("", "PINHOLE", "SIMPLE_PINHOLE")
 _BENT = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE")
 _FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
-
-
-JSON_MAX = 32 * MEBIBYTE
-"""Ten thousand frames of nerfstudio take 11 to 13 MiB, of a ``cameras.json`` 4."""
+JSON_MAX = 32 * MEBIBYTE  # ten thousand frames of nerfstudio take 11 to 13 MiB
 
 _JSON = UntrustedFile(
     DatasetError, "not readable as JSON", "a JSON file of cameras", "Save it again.", limit=JSON_MAX
@@ -81,18 +75,12 @@ def read(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]
 
 
 def _there(path: Path, named: list[tuple[Posed, Path]]) -> list[tuple[Posed, Path]]:
-    """The frames whose images are there; all if none is, which is another mistake.
-
-    instant-ngp leaves frames without images out, and its own scenes list some.
-    """
+    """The frames whose images are there, as instant-ngp has it; all if none is: another mistake."""
     there = [each for each in named if each[0].image.exists()]
-    if there and len(there) < len(named):
-        (gone, _), *_ = (each for each in named if not each[0].image.exists())
-        log.warning(
-            "%s: left out %d of its %d frames, which have no image, such as %s",
-            *(printable(str(path)), len(named) - len(there), len(named)),
-            printable(str(gone.image)),
-        )
+    if there and (gone := [row.image for row, _ in named if not row.image.exists()]):
+        said = "%s: left out %d of its %d frames, which have no image, such as %s"
+        first = printable(str(gone[0]))
+        log.warning(said, printable(str(path)), len(gone), len(named), first)
     return there or named
 
 
@@ -101,8 +89,7 @@ def read_transforms(path: Path, images: str = "images") -> list[Posed]:
 
     Every number may stand in a frame or in the file. Intrinsics are ``fl_x, fl_y, cx, cy`` where
     given, else ``camera_angle_x``, ``camera_angle_y`` and a centred principal point; ``w, h`` where
-    given, else the size of the image that the file lists, which then has to be there. Poses are
-    taken as they stand: an ``applied_transform`` has been applied.
+    given, else the size of the listed image. An ``applied_transform`` has been applied to poses.
     """
     content = load_json(path)
     with _TRANSFORMS.stated(path) as reading:
@@ -169,34 +156,24 @@ def _row(folder: Path, frame: dict[str, Any], images: str) -> Posed:
     fisheye, coefficients = _distortion(frame)
     lens = Lens(width, height, fx, fy, cx, cy, coefficients, fisheye)
     pose = opengl_pose(matrix(frame["transform_matrix"], (4, 4), (3, 4))[:3])
-    return Posed(
-        _name(listed),
-        lens.camera(*pose),
-        image,
-        None if lens.straight else lens,
-        folder / frame["mask_path"] if frame.get("mask_path") else None,
-    )
+    mask = folder / frame["mask_path"] if frame.get("mask_path") else None
+    bent = None if lens.straight else lens
+    return Posed(_name(listed), lens.camera(*pose), image, bent, mask)
 
 
 def _distortion(frame: dict[str, Any]) -> tuple[bool, tuple[float, ...]]:
     """Whether a frame's lens is a fisheye, and its coefficients in OpenCV's order."""
     model = str(frame.get("camera_model", "")).upper()
     if model not in (*_PINHOLES, *_BENT, *_FISHEYES):
-        raise DatasetError(
-            str(frame["file_path"])[:200],
-            f"camera_model {model[:80]!r}",
-            f"one of {', '.join((*_PINHOLES[1:], *_BENT, *_FISHEYES))}",
-            "Undistort the images first (colmap image_undistorter).",
-        )
+        found = f"camera_model {model[:80]!r}"
+        expected = f"one of {', '.join((*_PINHOLES[1:], *_BENT, *_FISHEYES))}"
+        remedy = "Undistort the images first (colmap image_undistorter)."
+        raise DatasetError(str(frame["file_path"])[:200], found, expected, remedy)
     fisheye = model in _FISHEYES or bool(frame.get("is_fisheye"))
     if "distortion_params" in frame:  # nerfstudio's, which go before the names
         names, values = ("k1", "k2", "k3", "k4", "p1", "p2"), frame["distortion_params"]
         if len(values) != len(names) and not (len(values) == 4 and fisheye):
             raise ValueError(f"{len(values)} distortion_params, not {', '.join(names)}")
         frame = frame | dict(zip(names, values, strict=False))
-    k1, k2, p1, p2, k3, k4, k5, k6 = (
-        float(frame.get(key, 0)) for key in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-    )
-    if fisheye:
-        return True, (k1, k2, k3, k4)
-    return False, (k1, k2, p1, p2, k3, k4, k5, k6)
+    order = "k1 k2 k3 k4" if fisheye else "k1 k2 p1 p2 k3 k4 k5 k6"
+    return fisheye, tuple(float(frame.get(name, 0)) for name in order.split())
