@@ -53,7 +53,6 @@ RULES = (
 @click.option(
     "--up",
     default="0,-1,0",
-    show_default=True,
     metavar="X,Y,Z",
     callback=_direction,
     help="With --orbit: up direction of the scene.",

@@ -34,29 +34,20 @@ _PICTURE: dict[str, Any] = {"width": 1280, "height": 720, "fov_y": 50.0}
 
 
 def orbit(splat: Model, count: int, up: tuple[float, float, float]) -> Named:
-    """Cameras once around a splat, from ``overview``'s height and distance, evenly spaced.
-
-    The one after the last would be the first.
-    """
+    """Cameras once around a splat, from ``overview``'s height and distance, evenly spaced."""
     first = overview(splat, up, **_PICTURE)
     centre, _ = bounds(splat)
     shape = _PICTURE | {"fov_y": math.degrees(2 * math.atan(first.tan_fov_y))}
     axis = torch.nn.functional.normalize(torch.tensor(up, dtype=torch.float64), dim=0)
     away = first.campos.double() - centre.double()
-    views = []
-    for number in range(count):
-        turn = Rotation.from_rotvec((2 * math.pi * number / count * axis).numpy())
-        eye = centre.double() + torch.from_numpy(turn.apply(away.numpy()))
-        view = look_at(eye.float(), centre, up, **shape)
-        views.append((f"orbit{number:04d}", view))
-    return views
+    turns = (2 * math.pi * number / count * axis for number in range(count))
+    around = (Rotation.from_rotvec(turn.numpy()).apply(away.numpy()) for turn in turns)
+    eyes = [(centre.double() + torch.from_numpy(each)).float() for each in around]
+    return [(f"orbit{n:04d}", look_at(eye, centre, up, **shape)) for n, eye in enumerate(eyes)]
 
 
 def along(cameras: Named, count: int) -> Named:
-    """Cameras on the way through given ones, in their order, at an even pace from one to the next.
-
-    The pictures have the size and lens of the first.
-    """
+    """Cameras through given ones, in their order, at an even pace, with the lens of the first."""
     views = [moved(cameras[0][1], view.viewmatrix, view.campos) for _, view in cameras]
     found = []
     for number in range(count):
@@ -80,14 +71,10 @@ def require_encoder() -> ModuleType:
 
 
 def write_mp4(path: Path, frames: Iterable[Tensor], fps: int) -> None:
-    """Write pictures as an H.264 film; an existing file stays until the film is complete.
+    """Write pictures as an H.264 film, whole or not at all; OutputError if it cannot be.
 
-    Args:
-        frames: (3, H, W) RGB in [0, 1] each, all of one size. A side of odd length loses its last
-            row or column, because H.264 halves the colours' sides.
-
-    Raises:
-        OutputError: the film cannot be written.
+    Frames are (3, H, W) RGB in [0, 1], all of one size. A side of odd length loses its last row or
+    column, because H.264 halves the colours' sides.
     """
     encoder = require_encoder()
     with replacing(path) as temporary:

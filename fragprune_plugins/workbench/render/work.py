@@ -15,13 +15,9 @@ from tqdm import tqdm
 
 from fragprune_plugins.errors import UsageError
 from fragprune_plugins.files.model import Model
-from fragprune_plugins.workbench.commands import opening
+from fragprune_plugins.workbench.commands import opening, options
 from fragprune_plugins.workbench.commands.command import Report
-from fragprune_plugins.workbench.commands.options import (
-    EngineOptions,
-    SceneOptions,
-    require_several,
-)
+from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
 from fragprune_plugins.workbench.distributed import ShardedEngine, part_of
 from fragprune_plugins.workbench.figures.evaluate import Candidate
 from fragprune_plugins.workbench.figures.pictures import save_image, stems
@@ -34,12 +30,8 @@ from fragprune_plugins.workbench.scenes.dataset import load_photographs
 from fragprune_plugins.workbench.scenes.generated import Named
 from fragprune_plugins.workbench.scenes.output import cameras_of
 
-FPS = 30
-"""Frames a second of a film."""
-
-FRAMES = 8 * FPS
-"""Frames of an orbit, and of a film at least."""
-
+FPS = 30  # frames a second of a film
+FRAMES = 8 * FPS  # frames of an orbit, and of a film at least
 _NO_FOLDER = (".gif", ".webm", ".mov", ".avi", ".mkv", ".png", ".jpg", ".jpeg", ".webp")
 
 
@@ -92,6 +84,7 @@ def render(
         drawn = {index: each[index] for each in ranks.gather(fragments) for index in each}
     if not ranks.first:
         return None
+    wrote = f"{out}, {len(drawn)} frames" if film else f"{len(files)} pictures to {out}"
     figures = {
         "model": str(model),
         "files": [str(file) for file in files],
@@ -100,7 +93,6 @@ def render(
         "engine": rasterizer.name,
         "device": str(device),
     }
-    wrote = f"{out}, {len(drawn)} frames" if film else f"{len(files)} pictures to {out}"
     return _report(figures, wrote, [*drawn.values()])
 
 
@@ -115,23 +107,20 @@ def _save(files: list[Path], draw: Callable[[int], Tensor], ranks: Ranks) -> Non
 
 def _report(figures: dict[str, Any], wrote: str, fragments: list[float]) -> Report:
     """The report, with fragments per pixel of each view."""
-    mean = sum(fragments) / len(fragments)
-    warnings = nothing_drawn(fragments)
+    mean, warnings = sum(fragments) / len(fragments), nothing_drawn(fragments)
     cut = "with cutoffs" if figures["truncated"] else "without cutoffs"
     lines = [f"Wrote {wrote} ({mean:.1f} fragments per pixel, {cut})."]
-    lines += [f"Warning: {each}" for each in warnings]
     data = figures | {"fragments_per_pixel": mean, "warnings": warnings}
-    return Report(data, "\n".join(lines))
+    return Report(data, "\n".join([*lines, *(f"Warning: {each}" for each in warnings)]))
 
 
 def _expect_place(out: Path, *, film: bool, shard: bool) -> None:
     """Check, before any work, that ``out`` can be what was asked for."""
     if shard:
-        require_several()
+        options.require_several()
     if out.suffix.lower() in _NO_FOLDER:
-        raise UsageError(
-            "--out", str(out), "a folder for PNG files, or a film in .mp4", "Choose another name."
-        )
+        expected = "a folder for PNG files, or a film in .mp4"
+        raise UsageError("--out", str(out), expected, "Choose another name.")
     if film:
         filming.require_encoder()
 

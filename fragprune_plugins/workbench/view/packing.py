@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import math
 import zlib
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -37,9 +38,7 @@ from fragprune_plugins.files.model import Model
 from fragprune_plugins.workbench.models.formats.arrays import Bytes, z_order
 from fragprune_plugins.workbench.models.formats.palette import codebook, nearest
 
-CUTOFF_MAX = -2 * math.log(ALPHA_MIN)
-"""The largest cutoff that decides anything: a fragment beyond it is fainter than 1/255."""
-
+CUTOFF_MAX = -2 * math.log(ALPHA_MIN)  # a fragment beyond it is fainter than 1/255
 _HALF_MAX = 65504.0
 
 
@@ -47,12 +46,8 @@ def pack(model: Model) -> tuple[bytes, dict[str, Any]]:
     """A model's tables, and what is needed to read them.
 
     Cutoffs are within 1e-4 of the model's, opacities within 1e-5, and scales within 0.02 % where
-    the largest is e^12 times the least.
-
-    Returns:
-        The bytes, and: ``gaussians``, ``degree``, ``truncated`` (has thresholds), ``stop`` (after
-        which pixels soon end; None for none), ``rim`` (which is always hard there), ``scales``
-        (least and largest logarithm of a scale).
+    the largest is e^12 times the least. Of the facts, ``scales`` are the least and the largest
+    logarithm of a scale.
     """
     drawn, falloff = model.splats(), model.falloff
     count, degree = len(model), model.sh_degree
@@ -65,13 +60,10 @@ def pack(model: Model) -> tuple[bytes, dict[str, Any]]:
 
     geometry = np.empty((count, 8), dtype="<u4")
     geometry[:, :3] = _array(model.xyz, "<f4").view("<u4")
-    geometry[:, 3] = _pair(_unsigned(drawn.opacities), _unsigned(cutoffs))
-    turns = np.round(_array(rotation, "<f8") * 32767).astype("<i2").view("<u2")
-    geometry[:, 4] = _pair(turns[:, 0], turns[:, 1])
-    geometry[:, 5] = _pair(turns[:, 2], turns[:, 3])
-    sizes = _unsigned(share)
-    geometry[:, 6] = _pair(sizes[:, 0], sizes[:, 1])
-    geometry[:, 7] = sizes[:, 2]
+    halves = geometry.view("<u2")  # of a word, the lower first
+    halves[:, 6], halves[:, 7] = _unsigned(drawn.opacities), _unsigned(cutoffs)
+    halves[:, 8:12] = np.round(_array(rotation, "<f8") * 32767).astype("<i2").view("<u2")
+    halves[:, 12:15], halves[:, 15] = _unsigned(share), 0
 
     texels = -(-3 * (degree + 1) ** 2 // 8)  # of four words, eight half floats
     harmonics = np.zeros((count, texels * 8), dtype="<f2")
@@ -96,31 +88,17 @@ def _unsigned(shares: torch.Tensor) -> NDArray[np.uint16]:
     return np.round(_array(shares, "<f8").clip(0, 1) * 65535).astype("<u2")
 
 
-def _pair(low: NDArray[Any], high: NDArray[Any]) -> NDArray[np.uint32]:
-    pair: NDArray[np.uint32] = low.astype("<u4") | (high.astype("<u4") << np.uint32(16))
-    return pair
-
-
 Words = NDArray[np.uint16]
-
-_BOOK = 256
-_BITS = 12
-_STEPS = 2048
-"""Least number of steps of a mean from the middle of a scene to its edge."""
-_FARTHEST = 1 << 29
-"""Steps of a mean whose differences surely fit into 32 bits."""
-
+_BOOK, _BITS = 256, 12
+_STEPS = 2048  # least number of steps of a mean from the middle of a scene to its edge
+_FARTHEST = 1 << 29  # steps of a mean whose differences surely fit into 32 bits
 _LEVEL = 7  # of zlib: 9 takes up to seven times as long for 1.6 % fewer bytes
 
 
 def compact(tables: bytes, facts: dict[str, Any]) -> tuple[bytes, dict[str, int], list[str]]:
-    """What ``pack`` gave, in few bytes.
+    """What ``pack`` gave, in few bytes; OverflowError if a mean is too far from all others.
 
-    Returns:
-        The bytes; ``bits`` and ``rows`` for the facts; what was rounded, as words for the user.
-
-    Raises:
-        OverflowError: a mean is too far from all others.
+    Returns the bytes; ``bits`` and ``rows`` for the facts; what was rounded, as words for the user.
     """
     count, coefficients = facts["gaussians"], 3 * (facts["degree"] + 1) ** 2
     geometry = np.frombuffer(tables, "<u4", count * 8).reshape(count, 8)
@@ -136,8 +114,8 @@ def compact(tables: bytes, facts: dict[str, Any]) -> tuple[bytes, dict[str, int]
     changed = {"positions": bool((fixed != means * 2.0**bits).any()), "rotations": turned}
 
     low, high = facts["scales"]
-    rounding = {
-        "opacities": (words[:, 6:7], _opacities),
+    rounding: dict[str, tuple[Words, Callable[[Words], Any]]] = {
+        "opacities": (words[:, 6:7], lambda shares: np.rint(shares / 257) * 257),  # to 8 bits
         "cutoffs": (words[:, 7:8], _cutoffs),
         "scales": (words[:, 12:15], lambda scales: _scales(scales, high - low)),
         "colours": (harmonics[:, :3], _colours),
@@ -145,15 +123,16 @@ def compact(tables: bytes, facts: dict[str, Any]) -> tuple[bytes, dict[str, int]
     }
     rows = count
     for name, (columns, rounded) in rounding.items():
-        values = rounded(columns)
+        values = rounded(columns).astype(np.uint16)
         changed[name] = bool((np.abs(values.astype(np.int32) - columns) > 1).any())
         seen = np.bincount(values.reshape(-1)) > 0
         book, codes = np.flatnonzero(seen), (np.cumsum(seen) - 1).astype(np.uint8)[values]
         parts.append(np.pad(book.astype("<u2"), (0, _BOOK - len(book))))
         if name == "harmonics" and codes.size:
-            codes, index = _different(codes)
-            rows = len(codes)
-            parts += [] if rows == count else [_planes(index)]
+            different, index = np.unique(codes, axis=0, return_inverse=True)
+            if len(different) <= 0.75 * count:  # else all rows stay, as they are
+                codes, rows = different, len(different)
+                parts.append(_planes(index.ravel()))
         parts.append(codes.T)
     data = zlib.compress(b"".join(np.ascontiguousarray(each).tobytes() for each in parts), _LEVEL)
     return data, {"bits": bits, "rows": rows}, [name for name in changed if changed[name]]
@@ -203,34 +182,19 @@ def _rotations(turns: NDArray[np.int16]) -> tuple[Bytes, bool]:
     return np.column_stack([three & 255, upper]).astype(np.uint8), bool((off[others] > 1).any())
 
 
-def _different(codes: Bytes) -> tuple[Bytes, NDArray[np.int64]]:
-    """The different rows, and which of them each row is; all rows where most differ."""
-    rows, index = np.unique(codes, axis=0, return_inverse=True)
-    return (rows, index.ravel()) if len(rows) <= 0.75 * len(codes) else (codes, index)
-
-
-def _opacities(shares: Words) -> Words:
-    """To 8 bits."""
-    rounded: Words = (np.rint(shares / 257) * 257).astype(np.uint16)
-    return rounded
-
-
-def _cutoffs(shares: Words) -> Words:
+def _cutoffs(shares: Words) -> Any:
     """To the codes of docs/reference/cutoff.md."""
-    steps = np.rint(shares * (256 / 65535)).clip(1, 256)
-    rounded: Words = np.rint(steps * (65535 / 256)).astype(np.uint16)
-    return rounded
+    return np.rint(np.rint(shares * (256 / 65535)).clip(1, 256) * (65535 / 256))
 
 
-def _scales(shares: Words, extent: float) -> Words:
+def _scales(shares: Words, extent: float) -> Any:
     """To steps of 1/16 of a logarithm, or to 256 values if that is more."""
     step = 65535 / 16 / extent
     rounded = np.rint(np.rint(shares / step) * step).clip(0, 65535).astype(np.uint16)
     if len(np.unique(rounded)) <= _BOOK:
         return rounded
     book = codebook(shares)
-    few: Words = np.rint(book)[nearest(book, shares)].astype(np.uint16)
-    return few
+    return np.rint(book)[nearest(book, shares)]
 
 
 def _singles(halves: Words) -> NDArray[np.float32]:
@@ -238,16 +202,14 @@ def _singles(halves: Words) -> NDArray[np.float32]:
     return halves.view(np.float16).astype(np.float32)
 
 
-def _colours(halves: Words) -> Words:
+def _colours(halves: Words) -> Any:
     """To 8 bits."""
     levels = np.floor(_singles(halves) * np.float32(0.15 * 255) + 128).clip(0, 255)
-    rounded: Words = ((levels / 255 - 0.5) / 0.15).astype(np.float16).view(np.uint16)
-    return rounded
+    return ((levels / 255 - 0.5) / 0.15).astype(np.float16).view(np.uint16)
 
 
-def _harmonics(halves: Words) -> Words:
+def _harmonics(halves: Words) -> Any:
     """To 5 bits of degree 1, and to 4 bits."""
     step = np.where(np.arange(halves.shape[1]) < 9, 8, 16)
     levels = np.floor(np.rint(_singles(halves) * np.float32(128)) / step + 0.5) * step
-    rounded: Words = (levels.clip(-128, 127) / 128 + 0).astype(np.float16).view(np.uint16)
-    return rounded
+    return (levels.clip(-128, 127) / 128 + 0).astype(np.float16).view(np.uint16)

@@ -33,16 +33,10 @@ from fragprune_plugins.workbench.scenes.dataset import Shot
 from fragprune_plugins.workbench.scenes.generated import bounds
 from fragprune_plugins.workbench.view.packing import compact, pack
 
-Site = dict[str, bytes]
-"""Names of files, with slashes, and what they hold."""
-
+Site = dict[str, bytes]  # names of files, with slashes, and what they hold
 STATIC = Path(__file__).parent / "static"
-
-SINGLE_MAX = 64 << 20
-"""Most bytes of models and photographs that one page holds: a page of 80 MiB."""
-
+SINGLE_MAX = 64 << 20  # most bytes of models and photographs that one page holds: a page of 80 MiB
 _SAFE = bytes.maketrans(b"<&", b",.")  # of base 85, so that no text ends or hides an element
-
 _MODULES = ("shaders", "compact", "sorting", "splats", "camera", "drawing", "main")  # in this order
 _PHOTOGRAPH_SIDE = 960
 
@@ -72,12 +66,8 @@ def make_site(
     cameras: Sequence[Shown],
     start: View,
 ) -> Site:
-    """All files of a viewer.
-
-    Args:
-        layers: one or two; the first is on the left.
-        cameras: to choose from; may be none.
-        start: the first camera; its background is the page's.
+    """All files of a viewer: of one or two layers from left to right, cameras to choose from, if
+    there are any, and the first camera, whose background is the page's.
     """
     site = {each.name: each.read_bytes() for each in sorted(STATIC.iterdir()) if each.is_file()}
     described = []
@@ -88,11 +78,10 @@ def make_site(
     centre, radius = bounds(models[0])
     listed = []
     for number, each in enumerate(cameras):
-        entry = {"name": each.name, **camera(each.view), "photograph": None}
-        if each.photograph is not None:
-            name = entry["photograph"] = f"photographs/{number:04d}.jpg"
+        name = f"photographs/{number:04d}.jpg" if each.photograph else None
+        listed.append({"name": each.name, **camera(each.view), "photograph": name})
+        if name and each.photograph:
             site[name] = _jpeg(each.photograph)
-        listed.append(entry)
     scene = {
         "title": title,
         "models": described,
@@ -133,37 +122,28 @@ def save_site(folder: Path, site: Site) -> None:
 
 
 def compacted(site: Site) -> tuple[Site, list[str]]:
-    """The same viewer with models that take few bytes, and what was rounded for that.
-
-    A model with a Gaussian that is too far from all others keeps its tables.
-    """
+    """The same viewer with models that take few bytes, and what was rounded for that."""
     scene, small = json.loads(site["scene.json"]), dict(site)
-    rounded: dict[str, None] = {}
+    rounded: list[str] = []
     for facts in scene["models"]:
         with contextlib.suppress(OverflowError):
             small[facts["file"]], more, names = compact(site[facts["file"]], facts)
             facts |= more
-            rounded |= dict.fromkeys(names)
+            rounded += names
     small["scene.json"] = json.dumps(scene, allow_nan=False).encode()
-    return small, list(rounded)
+    return small, list(dict.fromkeys(rounded))
 
 
 def single_page(site: Site) -> bytes:
-    """A viewer, better ``compacted``, as one HTML file, which a browser opens from disk.
-
-    Raises:
-        OutputError: it is larger than ``SINGLE_MAX``.
-    """
+    """A viewer, better ``compacted``, as one HTML file to open from disk, up to ``SINGLE_MAX``."""
     data = {name: each for name, each in site.items() if not (STATIC / name).is_file()}
     size = sum(map(len, data.values()))
     if size > SINGLE_MAX:
         expected = f"at most {SINGLE_MAX >> 20} MiB in one page"
         raise OutputError("--out", f"{size >> 20} MiB of data", expected, "Name a folder.")
     # Names of all modules differ, so that one after the other they are one module.
-    code = "\n".join(
-        re.sub(r"^(import .*|export (?=\w))", "", site[f"{name}.js"].decode(), flags=re.MULTILINE)
-        for name in _MODULES
-    )
+    modules = "\n".join(site[f"{name}.js"].decode() for name in _MODULES)
+    code = re.sub(r"^(import .*|export (?=\w))", "", modules, flags=re.MULTILINE)
     held = "".join(
         f'<script type="text/plain" data-name="{name}">{_text(name, each)}</script>\n'
         for name, each in data.items()
@@ -184,37 +164,26 @@ def single_page(site: Site) -> bytes:
 
 def _jpeg(photograph: Shot) -> bytes:
     """A photograph as a JPEG of at most ``_PHOTOGRAPH_SIDE`` pixels a side; none is enlarged."""
-    image = picture(photograph.image)
+    image, held = picture(photograph.image), io.BytesIO()
     image.thumbnail((_PHOTOGRAPH_SIDE, _PHOTOGRAPH_SIDE))
-    held = io.BytesIO()
     image.save(held, format="JPEG", quality=88)
     return held.getvalue()
 
 
 def _text(name: str, data: bytes) -> str:
     """Bytes as text of a page: photographs as browsers read them, the rest in less."""
-    if name.endswith(".jpg"):
-        return base64.b64encode(data).decode()
-    return base64.b85encode(data).translate(_SAFE).decode()
+    jpeg = name.endswith(".jpg")
+    return (base64.b64encode(data) if jpeg else base64.b85encode(data).translate(_SAFE)).decode()
 
 
 HOST = "127.0.0.1"
-
-_KINDS = {
-    "html": "text/html; charset=utf-8",
-    "css": "text/css; charset=utf-8",
-    "js": "text/javascript; charset=utf-8",
-    "json": "application/json",
-    "jpg": "image/jpeg",
-}
+_KINDS = {"json": "application/json", "jpg": "image/jpeg"}
+_KINDS |= {end: f"text/{end}; charset=utf-8" for end in ("html", "css")}
+_KINDS["js"] = "text/javascript; charset=utf-8"
 
 
 def open_server(site: Site, port: int = 0) -> ThreadingHTTPServer:
-    """A server of these files, bound to 127.0.0.1 and a port; 0 takes any free one.
-
-    Raises:
-        OutputError: the port cannot be had.
-    """
+    """A server of these files at 127.0.0.1; port 0 takes a free one. OutputError if it is taken."""
     try:
         return _Server((HOST, port), partial(_Handler, site))
     except OSError as error:
@@ -232,6 +201,14 @@ class _Server(ThreadingHTTPServer):
         """Say nothing of a browser that goes away before it has read its answer."""
         if not isinstance(sys.exc_info()[1], ConnectionError):
             super().handle_error(request, client_address)
+
+
+_HEADERS = {
+    "Cache-Control": "no-store",
+    "Content-Security-Policy": "frame-ancestors 'none'",  # the page itself says the rest
+    "X-Content-Type-Options": "nosniff",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -255,13 +232,9 @@ class _Handler(BaseHTTPRequestHandler):
             return
         self.send_response(HTTPStatus.OK)
         kind = _KINDS.get(name.rpartition(".")[2], "application/octet-stream")
-        self.send_header("Content-Type", kind)
-        self.send_header("Content-Length", str(len(content)))
-        self.send_header("Cache-Control", "no-store")
-        # The page has a policy of its own; only a header can say who may frame it.
-        self.send_header("Content-Security-Policy", "frame-ancestors 'none'")
-        self.send_header("X-Content-Type-Options", "nosniff")
-        self.send_header("Cross-Origin-Resource-Policy", "same-origin")
+        length = {"Content-Type": kind, "Content-Length": str(len(content))}
+        for header, value in (length | _HEADERS).items():
+            self.send_header(header, value)
         self.end_headers()
         if self.command == "GET":
             self.wfile.write(content)

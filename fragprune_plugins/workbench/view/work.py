@@ -9,14 +9,9 @@ from typing import Any
 import click
 
 from fragprune_plugins.errors import OutputError
-from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.reading import lies_in
+from fragprune_plugins.workbench.commands import opening
 from fragprune_plugins.workbench.commands.command import Report
-from fragprune_plugins.workbench.commands.opening import (
-    drawn_as_trained,
-    over_its_background,
-    warn_if_antialiased,
-)
 from fragprune_plugins.workbench.commands.options import SceneOptions
 from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.figures.viewing import overview
@@ -47,12 +42,13 @@ def view(
     other = other or _original(model)
     paths = [each for each in (model, other) if each is not None]
     models = [load(each) for each in paths]
-    warn_if_antialiased(*paths)
+    opening.warn_if_antialiased(*paths)
     truncated = [each.falloff is not None for each in models]
     if truncated == [True, False]:  # the original stands left of the split
         for each in (paths, models, truncated):
             each.reverse()
-    scene = over_its_background(model, SceneOptions(data, white_background=white_background))
+    scene = SceneOptions(data, white_background=white_background)
+    scene = opening.over_its_background(model, scene)
     shown = _cameras(scene, cameras or cameras_of(model), paths)
     start = shown[0].view if shown else overview(models[-1])
     if not shown:
@@ -74,16 +70,14 @@ def view(
         return Report(facts | {"address": address}, "The viewer is closed.")
     site, rounded = sites.compacted(site)
     if single:
-        page = sites.single_page(site)
-        with replacing(out) as temporary:
-            temporary.write_bytes(page)
-        site, files, what = {out.name: page}, [str(out)], str(out)
-        then = "Open it in a browser."
+        site = {out.name: sites.single_page(site)}
+        what, then = str(out), "Open it in a browser."
     else:
-        sites.save_site(out, site)
-        files, what = [str(out / name) for name in sorted(site)], f"{len(site)} files to {out}"
+        what = f"{len(site)} files to {out}"
         then = f"A web server has to serve them; here: python -m http.server -d {quoted(out)}"
-    size = sum(map(len, site.values()))
+    folder = out.parent if single else out
+    sites.save_site(folder, site)
+    size, files = sum(map(len, site.values())), [str(folder / name) for name in sorted(site)]
     facts |= {"bytes": size, "files": files, "rounded": rounded}
     how = f", with {', '.join(rounded)} rounded as in a .spz file" if rounded else ""
     return Report(facts, f"Wrote {what} ({size / 2**20:.1f} MiB){how}. {then}")
@@ -91,16 +85,15 @@ def view(
 
 def _original(model: Path) -> Path | None:
     """The model that a fine-tuning began with, by its record, if it lies in the same folder."""
-    record = records.beside(model)
-    if record is None:
+    if (record := records.beside(model)) is None:
         return None
     with records.RECORD_FILE.stated(record.path):
         name = record.data.get("model_before", record.data.get("model"))
         original = None if name is None else records.located(name, record.path.parent)
     inside = output_folder(model) or model.parent  # a record may be somebody else's
-    if original is None or not original.is_file() or not lies_in(original, inside):
-        return None
-    return None if original.samefile(model) else original
+    if original and original.is_file() and lies_in(original, inside):
+        return None if original.samefile(model) else original
+    return None
 
 
 def _layers(paths: list[Path], truncated: list[bool]) -> list[sites.Layer]:
@@ -124,12 +117,12 @@ def _told_apart(left: Path, right: Path) -> tuple[str, str]:
 def _cameras(scene: SceneOptions, cameras: Path | None, models: list[Path]) -> list[sites.Shown]:
     """The cameras of the page's list: held-out ones of a scene, or all of a file."""
     if scene.data is not None:
-        shots = load_photographs(drawn_as_trained(scene, *models)).test
+        shots = load_photographs(opening.drawn_as_trained(scene, *models)).test
         return [sites.Shown(shot.name, shot.view, shot) for shot in shots]
-    if cameras is not None:
-        named = load_cameras(cameras, white_background=scene.white_background)
-        return [sites.Shown(name, camera) for name, camera in named]
-    return []
+    if cameras is None:
+        return []
+    named = load_cameras(cameras, white_background=scene.white_background)
+    return [sites.Shown(name, camera) for name, camera in named]
 
 
 def _serve(site: sites.Site, port: int, *, browse: bool) -> str:
@@ -148,11 +141,7 @@ def _serve(site: sites.Site, port: int, *, browse: bool) -> str:
 
 def _expect_our_page(page: Path) -> None:
     """Raise OutputError if another page has the name of ours."""
-    if not page.is_file():
-        return
-    with open(page, "rb") as file:
-        if b'content="fragprune view"' in file.read(4096):
-            return
-    found = "a page that fragprune view did not write"
-    expected = "no page there, or one of fragprune view"
-    raise OutputError(str(page), found, expected, "Choose another --out, or delete the page.")
+    if page.is_file() and b'content="fragprune view"' not in page.read_bytes()[:4096]:
+        found = "a page that fragprune view did not write"
+        expected = "no page there, or one of fragprune view"
+        raise OutputError(str(page), found, expected, "Choose another --out, or delete the page.")
