@@ -299,7 +299,7 @@ def test_where_a_look_fails_we_learn_as_asked(scene, tmp_path, monkeypatch, capl
 
 
 def test_where_a_gpu_has_no_room_to_measure_the_rest_is_reported(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(work, "measure_all", Mock(side_effect=FULL))
+    monkeypatch.setattr(work.evaluate, "measure_all", Mock(side_effect=FULL))
     report = run_json("run", *WORDS, *command(scene, tmp_path / "out"))
     assert (report["iterations"], report["after"]) == (6, None)
     assert "Tried to allocate 2.00 GiB" in report["not_compared"]["found"]

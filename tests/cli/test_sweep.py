@@ -194,7 +194,7 @@ def test_words_behind_the_script_are_its_own(between, tmp_path, monkeypatch):
         asked.append(([*command], [each for each in options if each != "--"]))
         return Report({}, "")
 
-    monkeypatch.setattr("fragprune_plugins.workbench.run.run_sweep", swept)
+    monkeypatch.setattr("fragprune_plugins.workbench.run.sweep.run_sweep", swept)
     run("run", "--quick", *between, "all.sh", "--", "room")
     assert asked == [(["all.sh", "--", "room"], ["--quick"])]
 

@@ -15,7 +15,6 @@ from fragprune_plugins.workbench.commands.options import FILE, engine_options
     "--out",
     type=FILE,
     default="fragprune-demo",
-    show_default=True,
     help="Folder for the scene, the models, the pictures and index.html: a new folder, or the "
     "folder of an earlier demo, which is emptied.",
 )
@@ -23,10 +22,9 @@ from fragprune_plugins.workbench.commands.options import FILE, engine_options
     "--iters",
     type=click.IntRange(min=100),
     default=1000,
-    show_default=True,
     help="Iterations of the training; the fine-tuning runs half as many.",
 )
-@click.option("--seed", type=int, default=0, show_default=True, help="Seed of the training.")
+@click.option("--seed", type=int, default=0, help="Seed of the training.")
 @engine_options(device="Device; the scene is small enough for any CPU.", default="cpu")
 def command(**options: Any) -> Report:
     """Train a model of a small room, prune its fragments, and show original and pruned.

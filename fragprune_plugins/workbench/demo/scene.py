@@ -10,11 +10,8 @@ from PIL import Image
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.workbench.models.model import writable_folder
 
-ROOM = Path(__file__).with_name("room")
-"""``images/`` and ``sparse/0/``. ``python -m lab.room`` in docs/experiments made them."""
-
-VIEWS, WIDTH, POINTS = 48, 320, 4000
-"""Number of photographs, their width in pixels, and number of points."""
+ROOM = Path(__file__).with_name("room")  # ``images/``, ``sparse/0/``; by ``python -m lab.room``
+VIEWS, WIDTH, POINTS = 48, 320, 4000  # of photographs, their number and width in pixels; points
 
 
 def make_scene(
@@ -22,9 +19,7 @@ def make_scene(
 ) -> None:
     """Copy the photographs, their cameras and points to ``images/`` and ``sparse/0/`` of a folder.
 
-    Args:
-        views, points: how many, of 48 and 4000.
-        width: of the photographs in pixels, of 320; the height is three quarters of it.
+    There are up to 48 and 4000, at most 320 pixels wide and three quarters of that high.
     """
     images, sparse = writable_folder(folder / "images"), writable_folder(folder / "sparse" / "0")
     for photograph in sorted((ROOM / "images").iterdir())[:views]:

@@ -17,37 +17,25 @@ import click
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.injection.launch import RunOptions, run
-from fragprune_plugins.learning.goals import Control
-from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.learning import goals, schedule
 from fragprune_plugins.plugins.hooks import engine_for
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import open_engine
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.demo.folder import claiming, clear
 from fragprune_plugins.workbench.demo.scene import POINTS, VIEWS, WIDTH, make_scene
-from fragprune_plugins.workbench.figures import records, wording
-from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
+from fragprune_plugins.workbench.figures import evaluate, records, wording
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.report import page as report_page
 from fragprune_plugins.workbench.run.work import Looking, figures_of
 from fragprune_plugins.workbench.scenes.dataset import load_dataset
 
-HOST = Path(__file__).with_name("host") / "train.py"
-"""The training script of the demo's host."""
-
-REPORT = "report.json"
-"""The report's file in the demo's folder; the demo writes it last."""
-
-LARGER = 2
-"""How many times as wide and high the page's pictures are as the photographs of the training."""
-
-BANNER = "banner.jpg"
-"""The picture that shows all of it at a glance."""
-
+HOST = Path(__file__).with_name("host") / "train.py"  # the training script of the demo's host
+REPORT = "report.json"  # the report's file in the demo's folder; the demo writes it last
+LARGER = 2  # how many times as wide and high the page's pictures are as the photographs
+BANNER = "banner.jpg"  # the picture that shows all of it at a glance
 _FIRST = "view_032.webp"  # the table stands under the divider: both halves show the same things
-
 _TEMPLATE = Path(__file__).with_name("demo.html")
-
 _REPEATS = 5  # timed frames for each view
 
 
@@ -70,21 +58,20 @@ def demo(*, out: Path, iters: int, seed: int, engine: EngineOptions) -> Report:
     drawing = replace(engine, device=str(where))
     settings = DemoSettings(iterations=iters, finetune=iters // 2, seed=seed, engine=drawing)
     report = run_demo(out, settings, partial(click.echo, err=True))
-    table = wording.describe(wording.columns_of(report))
-    told = [wording.outcome("run", report, report["control"]), *wording.begun(report)]
-    text = (
-        f"\n{table}\n\n" + "\n".join(told) + "\n"
+    lines = [
+        "",
+        wording.describe(wording.columns_of(report)),
+        "",
+        wording.outcome("run", report, report["control"]),
+        *wording.begun(report),
         f"Took {report['seconds']:.0f} s. Open {out / 'index.html'} for the pictures. "
-        f"To turn it: fragprune view {wording.quoted(out)}"
-    )
-    return Report(report, text)
+        f"To turn it: fragprune view {wording.quoted(out)}",
+    ]
+    return Report(report, "\n".join(lines))
 
 
 def host_command(scene: Path, model: Path, settings: DemoSettings) -> list[str]:
-    """The command that trains the host on the scene.
-
-    Its flags scale the timetable of densification to the number of iterations.
-    """
+    """The command that trains the host on the scene; densification keeps pace with iterations."""
     n = settings.iterations
     flags: dict[str, object] = {
         "-s": scene,
@@ -108,38 +95,29 @@ def host_command(scene: Path, model: Path, settings: DemoSettings) -> list[str]:
 def run_demo(
     out: Path, settings: DemoSettings, say: Callable[[str], None] = lambda line: None
 ) -> dict[str, Any]:
-    """Train the host on the room, fine-tune, measure and draw; says a line at each part's start.
-
-    Returns:
-        The report, with the measurements on held-out views "before", "after" and "control".
-
-    Raises:
-        OutputError: the folder cannot be written, or holds files that no demo wrote.
-    """
+    """Train the host on the room, fine-tune, measure and draw; says how far it is."""
     clear(out)
     started = time.perf_counter()
     scene, model = out / "scene", out / "model"
     with claiming(out, "scene"):
         make_scene(scene, views=settings.views, width=settings.width, points=settings.points)
     command = host_command(scene.resolve(), model.resolve(), settings)
-    learning = Settings(iterations=settings.finetune, seed=settings.seed)
+    learning = schedule.Settings(iterations=settings.finetune, seed=settings.seed)
     at = settings.engine
     looking = Looking(at)
     options = RunOptions(settings=learning, engine=at.name, device=at.device, look=looking)
     with claiming(out, "model"), contextlib.redirect_stdout(sys.stderr):
-        say(
-            f"1/4  Training for {settings.iterations} iterations, then with a cutoff for "
-            f"every Gaussian for {settings.finetune}"
-        )
+        then = f"then with a cutoff for every Gaussian for {settings.finetune}"
+        say(f"1/4  Training for {settings.iterations} iterations, {then}")
         summary = run(command, options)
         say(f"2/4  The control: the same {settings.finetune} iterations without cutoffs")
-        without = replace(learning, goal=Control())
+        without = replace(learning, goal=goals.Control())
         zero = run(command, replace(options, stage="finetune", settings=without, look=None))
     saved = summary.model_before, summary.model_after, zero.model_after
     paths = [path for path in saved if path is not None]  # all: the host saves at its last step
     say("3/4  Measuring on the held-out views")
-    before, after, control = measure_all(
-        [Candidate(models.load(path, device=at.device)) for path in paths],
+    before, after, control = evaluate.measure_all(
+        [evaluate.Candidate(models.load(path, device=at.device)) for path in paths],
         load_dataset(scene).test,
         engine=at.name,
         repeats=_REPEATS,
@@ -170,7 +148,7 @@ def write_page(
     pictures = out / "pictures"
     saved = (report[f"model_{key}"] for key in ("before", "after"))
     one, other = (models.load(path, device=engine.device) for path in saved)
-    original, pruned = Candidate(one.untruncated()), Candidate(other)
+    original, pruned = evaluate.Candidate(one.untruncated()), evaluate.Candidate(other)
     shots = sorted(load_dataset(scene).test, key=lambda shot: shot.name != _FIRST)
     rasterizer = engine_for(engine.name, engine.device)
     drawn = report_page.draw_views(pictures, original, pruned, shots, rasterizer, LARGER)

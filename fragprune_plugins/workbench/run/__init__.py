@@ -9,23 +9,14 @@ from typing import Any
 import click
 
 from fragprune_plugins.errors import UsageError
+from fragprune_plugins.workbench.commands import config, learning, logs, rules
 from fragprune_plugins.workbench.commands.command import JSON, WORDS, Command, Report, work_of
-from fragprune_plugins.workbench.commands.config import config_option
-from fragprune_plugins.workbench.commands.learning import LEARNING_APART, learning_options
-from fragprune_plugins.workbench.commands.logs import log_option
 from fragprune_plugins.workbench.commands.options import engine_options
-from fragprune_plugins.workbench.commands.rules import Needs
-from fragprune_plugins.workbench.run.recognising import is_sweep
-from fragprune_plugins.workbench.run.sweep import run_sweep
+from fragprune_plugins.workbench.run import recognising, sweep
 
-RULES = (
-    *LEARNING_APART,
-    Needs(
-        "--from-iter",
-        ("--stage finetune", "--stage joint"),
-        "--stage finetune or joint, which learn inside one run",
-    ),
-)
+_STAGES = ("--stage finetune", "--stage joint")
+_INSIDE = "--stage finetune or joint, which learn inside one run"
+RULES = (*learning.LEARNING_APART, rules.Needs("--from-iter", _STAGES, _INSIDE))
 
 
 @click.command("run", cls=Command, rules=RULES, context_settings={"allow_interspersed_args": False})
@@ -35,7 +26,6 @@ RULES = (
     "--stage",
     type=click.Choice(["auto", "finetune", "joint", "off"]),
     default="auto",
-    show_default=True,
     help="auto: train, then fine-tune. finetune: only fine-tune the model in the output folder. "
     "joint: learn inside the training. off: only apply stored cutoffs.",
 )
@@ -45,9 +35,9 @@ RULES = (
     help="finetune, joint: learn after this iteration; joint's default is the end of densification "
     "by the host's own arguments.",
 )
-@learning_options(every_goal=False)
-@log_option
-@config_option
+@learning.learning_options(every_goal=False)
+@logs.log_option
+@config.config_option
 @engine_options(
     "Engine that rasterizes with cutoffs, or if the host's own rasterizer is missing",
     device="Device of the host; cpu runs a CUDA-only host without a GPU.",
@@ -86,7 +76,7 @@ def command(**options: Any) -> Report:
       fragprune run -- python render.py -m out                       (renders with cutoffs)
       fragprune run -- bash train_all.sh                             (each training in it)
     """
-    if not is_sweep(options["host_command"]):
+    if not recognising.is_sweep(options["host_command"]):
         return work_of(__name__, **options)
     context, script = click.get_current_context(), options["host_command"]
     if context.params["logs"]:
@@ -94,4 +84,4 @@ def command(**options: Any) -> Report:
         raise UsageError("--log", what, "one training, whose steps it writes", "Leave it out.")
     logging.basicConfig(level=logging.INFO, format="fragprune: %(message)s", stream=sys.stderr)
     words = context.meta[WORDS]  # it needs no torch: what it starts imports that
-    return run_sweep(script, words[: len(words) - len(script)], quietly=context.meta[JSON])
+    return sweep.run_sweep(script, words[: len(words) - len(script)], quietly=context.meta[JSON])

@@ -13,40 +13,31 @@ from fragprune_plugins.errors import DatasetError, UsageError, log
 from fragprune_plugins.files.atomic import locked
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.learning.schedule import QUICK_ITERATIONS, Settings
-from fragprune_plugins.workbench.commands.command import Report
-from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
+from fragprune_plugins.workbench.commands import command, options
 from fragprune_plugins.workbench.finetune.work import finetune
 from fragprune_plugins.workbench.ranks import launched
 from fragprune_plugins.workbench.run.unserved import BY_HAND, Unserved
-from fragprune_plugins.workbench.scenes.dataset import read_scene
-from fragprune_plugins.workbench.scenes.output import cameras_of, trained_on
-from fragprune_plugins.workbench.scenes.training import exposed
+from fragprune_plugins.workbench.scenes import dataset, output, training
 
 
 def train_then_finetune(
     host: Unserved,
     stage: str,
     settings: Settings,
-    engine: EngineOptions,
+    engine: options.EngineOptions,
     *,
     again: bool,
     json: bool,
-) -> Report:
-    """Train by the command alone, then do what ``fragprune finetune`` does with its PLY.
-
-    Args:
-        stage: "auto", or "finetune" for a host that has trained already.
-        json: stdout gets our object only.
-    """
+) -> command.Report:
+    """Train by the command alone, unless it has (stage "finetune"), then fine-tune its PLY."""
     if launched().several:
-        raise UsageError(
-            "run", "several processes", "one, for a codebase that no adapter fits", BY_HAND
-        )
+        expected = "one, for a codebase that no adapter fits"
+        raise UsageError("run", "several processes", expected, BY_HAND)
     settings = _settings_of(host.unlike, settings)
     log.info("no adapter fits (%s), but its PLY is plain 3DGS", host.why)
     photographs, since = host.photographs, 0.0
     if photographs is not None:  # better now than after a training
-        read_scene(photographs.folder, photographs.images)
+        dataset.read_scene(photographs.folder, photographs.images)
     if stage == "auto":
         since = time.time() - 1  # file systems round
         if host.output is not None:
@@ -58,7 +49,7 @@ def train_then_finetune(
         remedy = "Add -m FOLDER, also if the training knows no -m: it is not started again."
         raise UsageError("command", "no -m", "the output folder of the training", remedy)
     model = host.saved(since)
-    if not host.unlike and (name := exposed(model)):
+    if not host.unlike and (name := training.exposed(model)):
         settings = _settings_of(f"it learned an exposure for {name}", settings)
     out = model.with_name("pruned.ply" if settings.goal.presses else "control.ply")
     log.info("%s learns by vanilla 3DGS's drawing and loss, as in fragprune finetune", model)
@@ -82,16 +73,16 @@ def train_then_finetune(
 
 def _scene_of(
     model: Path, photographs: Photographs | None, settings: Settings
-) -> tuple[Photographs | None, SceneOptions]:
+) -> tuple[Photographs | None, options.SceneOptions]:
     """The photographs of a model's training, by what it wrote or else these, and its cameras."""
     with contextlib.suppress(DatasetError):  # what it wrote as its arguments may be anything
-        photographs = trained_on(model) or photographs
+        photographs = output.trained_on(model) or photographs
     if photographs is None:
-        return None, SceneOptions()
-    data = None if settings.itself and cameras_of(model) else photographs.folder
+        return None, options.SceneOptions()
+    data = None if settings.itself and output.cameras_of(model) else photographs.folder
     if not settings.itself:
         log.info("from the photographs in %s", data)
-    return photographs, SceneOptions(data, white_background=photographs.white_background)
+    return photographs, options.SceneOptions(data, white_background=photographs.white_background)
 
 
 def _settings_of(unlike: str, settings: Settings) -> Settings:

@@ -25,8 +25,7 @@ SINGLY = "Put fragprune run -- in front of each training."
 def is_sweep(command: Sequence[str]) -> bool:
     """Whether a command runs a script that trains nothing itself, but starts others that do.
 
-    Raises:
-        UsageError: it does, in a way in which they cannot be served.
+    UsageError if it starts them in a way in which they cannot be served.
     """
     name = Path(command[0]).name if command else ""
     if name in _SHELLS or name.endswith(".sh"):
@@ -48,12 +47,9 @@ def _expect_seen(script: Path, lines: Sequence[str]) -> None:
     """Refuse a script that would not find our ``python``."""
     for line in lines:
         if _PAST.search(line):
-            raise UsageError(
-                str(script),
-                f"{line.strip()!r}, which starts a python that fragprune does not see",
-                "the word python alone, in an environment that is active already",
-                f"Take that out, or: {SINGLY}",
-            )
+            found = f"{line.strip()!r}, which starts a python that fragprune does not see"
+            expected = "the word python alone, in an environment that is active already"
+            raise UsageError(str(script), found, expected, f"Take that out, or: {SINGLY}")
 
 
 def _started_by(here: HostRepo, script: Path) -> list[str]:

@@ -17,23 +17,16 @@ from typing import Any
 
 from fragprune_plugins.errors import FragpruneError, UnknownHostError, UsageError, log
 from fragprune_plugins.files.atomic import replacing
-from fragprune_plugins.hosts.choosing import locate
-from fragprune_plugins.hosts.source import HostRepo
+from fragprune_plugins.hosts import choosing, source
 from fragprune_plugins.injection.command import split
 from fragprune_plugins.plugins.loading import installed
 from fragprune_plugins.workbench.figures.records import strict
-from fragprune_plugins.workbench.run import command
-from fragprune_plugins.workbench.run.recognising import is_sweep
-from fragprune_plugins.workbench.run.sweep import HELD, OPTIONS, STOPPED
+from fragprune_plugins.workbench.run import command, recognising, sweep
 from fragprune_plugins.workbench.run.unserved import unserved
 
 
 def main(folder: Path, words: list[str]) -> None:
-    """Run what the interpreter is told, and leave what became of it in the folder if it is served.
-
-    Args:
-        folder: of the sweep; its options lie there.
-    """
+    """Run what the interpreter is told, and leave what became of it in the sweep's folder."""
     logging.basicConfig(level=logging.INFO, format="fragprune: %(message)s", stream=sys.stderr)
     warned = MemoryHandler(1000, logging.CRITICAL)  # stderr may go anywhere
     warned.setLevel(logging.WARNING)
@@ -46,10 +39,10 @@ def main(folder: Path, words: list[str]) -> None:
         os.execv(sys.executable, [sys.executable, *words])
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's & has it ignored
     signal.signal(signal.SIGHUP, signal.SIG_IGN)  # it ends the shells around, not what saves
-    options, reports = json.loads((folder / OPTIONS).read_text()), list[Any]()
+    options, reports = json.loads((folder / sweep.OPTIONS).read_text()), list[Any]()
     done |= {"pid": os.getpid(), "exit_code": None}
     _write(result, done, warned)
-    if (folder / STOPPED).exists():
+    if (folder / sweep.STOPPED).exists():
         sys.exit(130)
     done["exit_code"] = 1
     try:
@@ -72,22 +65,20 @@ def _is_served(words: list[str]) -> bool:
     """Whether ``fragprune run`` serves a script: a host's, or one that starts such."""
     try:
         script, _, _ = split(["python", *words], quietly=True)
-        if is_sweep(["python", *words]):
-            return True
-        locate(HostRepo(script.parent), installed().adapters)
+        if not recognising.is_sweep(["python", *words]):
+            choosing.locate(source.HostRepo(script.parent), installed().adapters)
     except UsageError:  # no script: -c, or a module of the standard library
         return False
     except UnknownHostError as error:
-        if unserved(["python", *words]):
-            return True
-        if "train" in script.stem:
+        served = unserved(["python", *words]) is not None
+        if not served and "train" in script.stem:
             log.warning("%s runs as it is, unpruned: %s", script.name, error)
-        return False
+        return served
     except FragpruneError:  # it is a host's; the error is stated where it runs
-        return True
+        pass
     return True
 
 
 if __name__ == "__main__":
-    os.set_inheritable(HELD, False)
+    os.set_inheritable(sweep.HELD, False)
     main(Path(sys.argv[1]), sys.argv[2:])

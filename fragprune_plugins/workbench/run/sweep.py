@@ -30,9 +30,7 @@ from fragprune_plugins.workbench.run.recognising import SINGLY
 
 OPTIONS = "options.json"
 STOPPED, RUNNING = "stopped", "running"
-HELD = 9
-"""What is started holds the pipe RUNNING open by this number, until it ends."""
-
+HELD = 9  # what is started holds the pipe RUNNING open by this number, until it ends
 _BEGINS = 0.5  # seconds; what a shell left behind with & may not hold the pipe yet
 _SHIM = """#!/bin/sh
 exec 9<>{pipe}
@@ -45,13 +43,7 @@ exec {ours} "$@"
 def run_sweep(command: Sequence[str], options: Sequence[str], *, quietly: bool) -> Report:
     """Run such a script, with each of a host's that it starts as if ``fragprune run`` stood there.
 
-    Args:
-        options: the words of ``fragprune run`` in front of the command.
-        quietly: what the scripts print goes to stderr.
-
-    Raises:
-        HostFailed: it ended with an error code, or started nothing that is served.
-        UsageError: this system has no shell for it.
+    ``options`` are the words in front of the command; with ``quietly`` scripts print to stderr.
     """
     words, name = list(command), shlex.join(command)
     if os.name != "posix":
@@ -80,17 +72,13 @@ def run_sweep(command: Sequence[str], options: Sequence[str], *, quietly: bool) 
 
 def _shims(folder: Path, options: Sequence[str]) -> Path:
     """Write what is found in place of ``python``; returns its folder."""
-    (folder / OPTIONS).write_text(
-        json.dumps([_anywhere(each) for each in options if each not in ("--", "--json")])
-    )
+    kept = [_anywhere(each) for each in options if each not in ("--", "--json")]
+    (folder / OPTIONS).write_text(json.dumps(kept))
     shims = folder / "bin"
     shims.mkdir()
     words = [sys.executable, "-m", "fragprune_plugins.workbench.run.started", str(folder)]
-    text = _SHIM.format(
-        pipe=shlex.quote(str(folder / RUNNING)),
-        python=shlex.quote(sys.executable),
-        ours=shlex.join(words),
-    )
+    pipe, python = (shlex.quote(str(each)) for each in (folder / RUNNING, sys.executable))
+    text = _SHIM.format(pipe=pipe, python=python, ours=shlex.join(words))
     major, minor = sys.version_info[:2]
     for name in ("python", f"python{major}", f"python{major}.{minor}"):
         (shims / name).write_text(text)
@@ -170,10 +158,9 @@ def _line(run: dict[str, Any]) -> str:
         code = run["exit_code"]
         said.append("was killed" if code is None else f"ended with exit code {code}")
     elif data.get("before"):
-        gained = wording.outcome("run", data, data["control"])
-        said.append(
-            gained if data["control"] else f"{wording.gain(data['before'], data['after'])}."
-        )
+        gained = f"{wording.gain(data['before'], data['after'])}."
+        control = data["control"]
+        said.append(wording.outcome("run", data, control) if control else gained)
     said += [data["model_after"]] if data.get("model_after") else []
     if data.get("adapter", "") is None:  # its render.py is not served
         said.append(f"The codebase itself draws {data['model_before']}, which is not pruned.")

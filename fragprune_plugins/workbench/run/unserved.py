@@ -10,10 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fragprune_plugins.errors import HostFailed
-from fragprune_plugins.hosts.adapter import Flags
-from fragprune_plugins.hosts.choosing import attempt, folder_above
+from fragprune_plugins.hosts import adapter, choosing, source
 from fragprune_plugins.hosts.photographs import Photographs
-from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.command import split
 from fragprune_plugins.learning.interruption import Terminate, sigterm_interrupts
 from fragprune_plugins.plugins.loading import load_plugins
@@ -25,23 +23,14 @@ BY_HAND = "fragprune finetune MODEL.ply --data SCENE --out pruned.ply learns on 
 
 @dataclass(frozen=True)
 class Unserved:
-    """A training command of a codebase that no adapter fits, and whose PLY is plain 3DGS.
+    """A training command of a codebase that no adapter fits, and whose PLY is plain 3DGS."""
 
-    Attributes:
-        program: the words of the command that name what the interpreter runs.
-        arguments: those after them.
-        output: the folder that it names as 3DGS does; None if it names none.
-        photographs: likewise, and how it reads them.
-        why: what speaks against the nearest adapter.
-        unlike: why its model's pictures may differ from the photographs; see ``Plain``.
-    """
-
-    program: tuple[str, ...]
-    arguments: tuple[str, ...]
-    output: Path | None
-    photographs: Photographs | None
-    why: str
-    unlike: str = ""
+    program: tuple[str, ...]  # the words of the command that name what the interpreter runs
+    arguments: tuple[str, ...]  # those after them
+    output: Path | None  # the folder that it names as 3DGS does; None if it names none
+    photographs: Photographs | None  # likewise, and how it reads them
+    why: str  # what speaks against the nearest adapter
+    unlike: str = ""  # why its model's pictures may differ from the photographs; see ``Plain``
 
     def train(self, *, quietly: bool) -> None:
         """Run the command in a process of its own; with ``quietly`` it prints to stderr."""
@@ -59,10 +48,7 @@ class Unserved:
             raise HostFailed(self.program[-1], f"exit code {code}", "a training to its end", remedy)
 
     def saved(self, since: float) -> Path:
-        """The PLY that it wrote last, since a time; what it makes of one lies in folders below it.
-
-        Another folder than the one that it names may be another training's.
-        """
+        """The PLY that it wrote last, since a time; below its folder lie others made of it."""
         folder = self.output or Path.cwd()
         found = [each for each in folder.rglob("point_cloud.ply") if each.stat().st_mtime >= since]
         if not found:
@@ -74,19 +60,19 @@ class Unserved:
 def unserved(command: Sequence[str]) -> Unserved | None:
     """The command, if it trains, no adapter fits its codebase, and that saves plain 3DGS."""
     script, arguments, module = split(list(command), quietly=True)
-    here, plugins = HostRepo(script.parent), load_plugins()
+    here, plugins = source.HostRepo(script.parent), load_plugins()
     trains = "train" in script.stem or ".backward(" in here.read(script)
-    folders = [here, *folder_above(here)] if trains else []
+    folders = [here, *choosing.folder_above(here)] if trains else []
     found = ((each, models_of(each, plugins)[0]) for each in folders)
     repo, own = next((pair for pair in found if pair[1]), (here, None))
     models = set(re.findall(r"\b\w*GaussianModel\w*", here.read(script)))
     if own is None or (models and own.model not in models):  # another may save other columns
         return None
-    tried = attempt(repo, plugins.adapters)
+    tried = choosing.attempt(repo, plugins.adapters)
     if any(match.fits for match in tried.values()):
         return None
     program = ("-m", module) if module else (str(script),)
-    parser = Flags(add_help=False, allow_abbrev=False)
+    parser = adapter.Flags(add_help=False, allow_abbrev=False)
     parser.add_argument("-m", "--model_path", type=Path)
     parser.add_argument("-s", "--source_path")
     parser.add_argument("-i", "--images", default="images")

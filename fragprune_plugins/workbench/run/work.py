@@ -19,44 +19,34 @@ import click
 import torch
 from torch import Tensor
 
+from fragprune_plugins import errors
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.errors import (
-    FragpruneError,
-    HostFailed,
-    NotComparedError,
-    SidecarError,
-    UnknownHostError,
-    log,
-)
+from fragprune_plugins.errors import FragpruneError, NotComparedError, log
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs
-from fragprune_plugins.injection import launch
-from fragprune_plugins.injection.process import current_gpu
+from fragprune_plugins.injection import launch, process
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.types import RasterInputs, RasterOutputs
+from fragprune_plugins.workbench.commands import logs, opening
 from fragprune_plugins.workbench.commands.command import JSON, Report
-from fragprune_plugins.workbench.commands.logs import Bar, logging_steps
-from fragprune_plugins.workbench.commands.opening import bound_threads, open_engine
 from fragprune_plugins.workbench.commands.options import EngineOptions
-from fragprune_plugins.workbench.figures import records, wording
-from fragprune_plugins.workbench.figures.evaluate import Candidate, measure_all
-from fragprune_plugins.workbench.figures.matching import told_or_matched
+from fragprune_plugins.workbench.figures import evaluate, matching, records, wording
 from fragprune_plugins.workbench.finetune.trial import Trial, tried
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.pruning import kept
 from fragprune_plugins.workbench.run.afterwards import train_then_finetune
 from fragprune_plugins.workbench.run.unserved import Unserved, unserved
-from fragprune_plugins.workbench.scenes.generated import views_near
-from fragprune_plugins.workbench.scenes.output import read_otherwise, saw_all
-from fragprune_plugins.workbench.scenes.training import saw_held_out
+from fragprune_plugins.workbench.scenes import generated, output, training
 
-_WHERE = {"joint": "inside the training"}
-_CONTROL = (
+_OF_SUMMARY = (
+    *("adapter", "engine", "device", "stage", "gaussians", "settings"),
+    *("train_seconds", "target_reached", "already_finished"),
+)
+_CONTROL = (  # joint learning has no model of before
     "To see what pruning did, train as long with --stage off and another output folder, and run "
     "fragprune compare."
 )
-"""Joint learning has no model of before."""
 
 
 def run(
@@ -71,7 +61,7 @@ def run(
     trust: bool,
 ) -> Report:
     """Do what ``fragprune run`` promises; its options are the arguments."""
-    bound_threads(engine.threads)
+    opening.bound_threads(engine.threads)
     logging.basicConfig(level=logging.INFO, format="fragprune: %(message)s", stream=sys.stderr)
     as_json = click.get_current_context().meta[JSON]
     looking = Looking(engine)
@@ -90,7 +80,7 @@ def run(
     # A host prints to stdout; with --json, stdout gets only our object.
     with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
         warmup = 0 if stage == "joint" else settings.warmup
-        with logging_steps([Bar(settings.iterations, warmup)]):
+        with logs.logging_steps([logs.Bar(settings.iterations, warmup)]):
             summary = _launched(host_command, options)
         if isinstance(summary, Unserved):
             return train_then_finetune(summary, stage, settings, engine, again=again, json=as_json)
@@ -100,18 +90,16 @@ def run(
         not_compared = _not_compared(summary)
         if photographs:
             try:
-                with current_gpu(engine.device), _enough_memory():
+                with process.current_gpu(engine.device), _enough_memory():
                     photographs, (*first, after) = measure_models(photographs, engine)
                     before = first[0] if first else None
             except FragpruneError as error:  # the trained model is saved already
                 not_compared = error
     data = figures_of(summary, settings, looking, before, after, not_compared, host_command)
     if (summary.steps or after) and summary.model_after:
-        read = photographs and photographs.as_dict()
-        more = {"curves": summary.curves, "photographs": read}
+        more = {"curves": summary.curves, "photographs": photographs and photographs.as_dict()}
         if after and not summary.steps:  # a run that was interrupted while it measured
-            more["iterations"] = summary.settings["iterations"]
-            more["gaussians"] = after["gaussians"]
+            more |= {"iterations": summary.settings["iterations"], "gaussians": after["gaussians"]}
         code = records.leave_or_tell(summary.model_after, "run", data | more)
     return Report(data, _describe(summary, data), code)
 
@@ -124,7 +112,7 @@ def _launched(command: Sequence[str], options: launch.RunOptions) -> launch.RunS
             log.info("it was learned before by a command with other options: learning again")
             summary = launch.run(list(command), replace(options, stage="finetune", again=True))
         return summary
-    except UnknownHostError:
+    except errors.UnknownHostError:
         after = options.stage in ("auto", "finetune") and options.from_iter is None
         host = unserved(command) if after and options.adapter is None else None
         if host is None:
@@ -151,10 +139,7 @@ def _not_compared(summary: launch.RunSummary) -> FragpruneError | None:
 
 
 def _expect_steps(summary: launch.RunSummary, options: launch.RunOptions) -> None:
-    """Refuse a stage 2 that took no step, and warn of one that ended, or was lost, before its last.
-
-    A host may make its steps elsewhere than where they are counted, or by another optimizer.
-    """
+    """Refuse a stage 2 that took no step, and warn of one that ended before its last."""
     wanted = summary.settings.get("iterations", summary.steps)  # a method may count otherwise
     begun = (summary.model_before or summary.steps) and not summary.already_finished
     if not begun or summary.steps >= wanted:
@@ -166,33 +151,30 @@ def _expect_steps(summary: launch.RunSummary, options: launch.RunOptions) -> Non
     found = f"stage 2 ended after {summary.steps} of {wanted} iterations"
     expected = "the length that its command says, whatever a file of options says"
     remedy = "Take the length out of that file; or prune the trained PLY: fragprune finetune."
-    error = HostFailed(f"{summary.adapter}'s script", found, expected, remedy)
+    error = errors.HostFailed(f"{summary.adapter}'s script", found, expected, remedy)
     if not summary.steps:
         raise error
     log.warning("%s", error)
 
 
 def _expect_thresholds(summary: launch.RunSummary, settings: Settings) -> None:
-    """Refuse a model without what stage 2 learned: the host moved or wrote files after it saved.
-
-    Where no model was found, its thresholds may lie anywhere in the host's folder.
-    """
+    """Refuse a model without what stage 2 learned: the host moved or wrote files after it saved."""
     model, folder = summary.model_after, summary.output
     if not (summary.steps and settings.goal.learns and folder):
         return
     if model and (model.suffix != ".ply" or sidecar.find(model)):  # a checkpoint holds them itself
         return
     left = sorted(folder.rglob(f"*{sidecar.SUFFIX}"))
+    if not model and (left or _in_checkpoints(folder)):
+        return
+    found = "no model was saved when stage 2 had ended"
+    remedy = "Have the host save its model at its last iteration, and run it again."
     if model:
         found = f"{sidecar.path_beside(model).name} is not beside it"
         found += f"; in the folder there is {left[-1]}" if left else ""
         remedy = "Look where the host moved the model that it saved, and move the thresholds there."
-    elif left or _in_checkpoints(folder):
-        return
-    else:
-        found = "no model was saved when stage 2 had ended"
-        remedy = "Have the host save its model at its last iteration, and run it again."
-    raise SidecarError(str(model or folder), found, "the thresholds that were learned", remedy)
+    expected = "the thresholds that were learned"
+    raise errors.SidecarError(str(model or folder), found, expected, remedy)
 
 
 def _in_checkpoints(folder: Path) -> bool:
@@ -206,12 +188,10 @@ def _enough_memory() -> Iterator[None]:
     try:
         yield
     except torch.cuda.OutOfMemoryError as error:
-        raise NotComparedError(
-            "the GPU's memory",
-            str(error).partition(". GPU")[0],
-            "room for the models that the host trained",
-            "Compare them with fragprune compare, on a CPU if need be.",
-        ) from error
+        found = str(error).partition(". GPU")[0]
+        expected = "room for the models that the host trained"
+        remedy = "Compare them with fragprune compare, on a CPU if need be."
+        raise NotComparedError("the GPU's memory", found, expected, remedy) from error
 
 
 def figures_of(
@@ -225,13 +205,8 @@ def figures_of(
 ) -> dict[str, Any]:
     """What --json prints of a run, from its measurements on held-out views."""
     trial = looking.trial
-    data: dict[str, Any] = {
-        "adapter": summary.adapter,
-        "engine": summary.engine,
-        "device": summary.device,
-        "stage": summary.stage,
+    data: dict[str, Any] = {name: getattr(summary, name) for name in _OF_SUMMARY} | {
         "iterations": summary.steps,
-        "gaussians": summary.gaussians,
         "gaussians_before": looking.gaussians,
         "training_views": {
             "fragments_per_pixel_before": summary.fragments_before,
@@ -246,11 +221,7 @@ def figures_of(
         "keep": trial and trial.keep,
         "forgotten": trial and trial.forgotten,
         "pressure": summary.curves[-1]["pressure"] if summary.curves else None,
-        "train_seconds": summary.train_seconds,
-        "target_reached": summary.target_reached,
-        "already_finished": summary.already_finished,
         "seed": settings.seed,
-        "settings": summary.settings,
         "host_options": _options(host_command),
     }
     of_folder = records.files(summary.output, below=True) if summary.output else []
@@ -263,12 +234,6 @@ def _options(command: Sequence[str]) -> list[str]:
     scripts = [place for place, word in enumerate(command) if word.endswith(".py")]
     words = command[scripts[0] + 1 :] if scripts else command
     return sorted(word for word in words if not os.path.exists(word.rpartition("=")[2]))
-
-
-def _saved(summary: launch.RunSummary) -> str:
-    """Where a model is that is no PLY."""
-    kept = summary.output is not None and _in_checkpoints(summary.output)
-    return f"the last checkpoint in {summary.output}" if kept else "not saved by the host"
 
 
 def photographs_of(summary: launch.RunSummary) -> records.Recorded | None:
@@ -286,18 +251,15 @@ def measure_models(
 ) -> tuple[records.Recorded, list[dict[str, Any]]]:
     """Measure the models on held-out views, around the point and of the alpha that the first shows.
 
-    A host whose code does not always take the middle may read another by an option alone.
-
-    Returns:
-        What was read, with how photographs were; and the figures of each model.
+    Returns what was read, with how photographs were, and the figures of each model.
     """
     at = EngineOptions(engine.name, "cpu" if engine.device == "cpu" else "auto")
-    rasterizer, where = open_engine(at)  # on the host's device, if it can draw there
+    rasterizer, where = opening.open_engine(at)  # on the host's device, if it can draw there
     models = [load(path, filtered=read.filtered, device=where) for path in read.models]
     host = _AsTheHost(rasterizer.name, rasterizer, read.drawing)
-    photographs, dataset = told_or_matched(models[0], read.photographs, host)
-    candidates = [Candidate(model, read.drawing) for model in models]
-    figures = measure_all(candidates, dataset.test, engine=rasterizer)
+    photographs, dataset = matching.told_or_matched(models[0], read.photographs, host)
+    candidates = [evaluate.Candidate(model, read.drawing) for model in models]
+    figures = evaluate.measure_all(candidates, dataset.test, engine=rasterizer)
     return replace(read, photographs=photographs), figures
 
 
@@ -324,12 +286,15 @@ def _describe(summary: launch.RunSummary, data: dict[str, Any]) -> str:
             why = "{where}: {found}. {remedy}".format(**data["not_compared"])
             lines.append(f"Not compared on held-out views because of {why}")
     pressure = f" at pressure {summary.curves[-1]['pressure']:.2g}" if summary.curves else ""
-    learned = "of the control" if control else _WHERE.get(summary.stage, "of stage 2")
+    within = "inside the training" if summary.stage == "joint" else "of stage 2"
+    saved: Path | str | None = summary.model_after
+    if saved is None:
+        kept = summary.output and _in_checkpoints(summary.output)
+        saved = f"the last checkpoint in {summary.output}" if kept else "not saved by the host"
     lines.append(
         f"{summary.adapter}, {summary.engine or 'host'} engine on {summary.device}: "
-        f"{summary.steps} iterations {learned}{pressure}, "
-        f"{summary.train_seconds:.0f} s in all. "
-        f"Model: {summary.model_after or _saved(summary)}."
+        f"{summary.steps} iterations {'of the control' if control else within}{pressure}, "
+        f"{summary.train_seconds:.0f} s in all. Model: {saved}."
     )
     if summary.model_after and summary.output:
         scene = summary.photographs.folder if summary.photographs else None
@@ -367,24 +332,20 @@ def _viewable(path: Path) -> Model | None:
 
 @dataclass
 class Looking:
-    """What ``RunOptions.look`` calls; ``trial`` is None where nothing could be tried.
-
-    Attributes:
-        gaussians: that the model had.
-        seen: the training of stage 1 has seen held-out views.
-    """
+    """What ``RunOptions.look`` calls."""
 
     engine: EngineOptions
-    trial: Trial | None = None
-    gaussians: int = 0
-    seen: bool = False
+    trial: Trial | None = None  # None where nothing could be tried
+    gaussians: int = 0  # that the model had
+    seen: bool = False  # whether the training of stage 1 has seen held-out views
 
     def __call__(
         self, ply: Path, photographs: Photographs, drawing: Mapping[str, Any], settings: Settings
     ) -> tuple[Settings, Tensor | None]:
         """Make the trial of ``fragprune finetune``, and score the Gaussians as it does."""
-        self.seen = saw_all(ply)  # stage 2 writes its own arguments over those of stage 1
-        if other := read_otherwise(ply, photographs):
+        told = output.arguments(ply)  # stage 2 writes its own over those of stage 1
+        self.seen = told is not None and not told.held_out
+        if other := output.read_otherwise(ply, photographs):
             said = "%s: its training had another %s (cfg_args); stage 2 learns by this command"
             log.warning(said, ply, ", ".join(other))
         try:
@@ -398,15 +359,15 @@ class Looking:
     def _look(
         self, ply: Path, photographs: Photographs, drawing: Mapping[str, Any], settings: Settings
     ) -> tuple[Settings, Tensor | None]:
-        rasterizer, device = open_engine(self.engine)
+        rasterizer, device = opening.open_engine(self.engine)
         engine = _AsTheHost(rasterizer.name, rasterizer, drawing)
         model = load(ply, filtered=True, device=device)
-        _, dataset = told_or_matched(model, photographs, engine)
-        self.seen |= saw_held_out(ply, dataset)
+        _, dataset = matching.told_or_matched(model, photographs, engine)
+        self.seen |= training.saw_held_out(ply, dataset)
         trial, left = tried(model, dataset, settings, engine=engine, say=log.info), None
         if trial.keep is not None:
             shots = dataset.train
-            views = views_near(shots, seed=settings.seed)
+            views = generated.views_near(shots, seed=settings.seed)
             left = kept(model, trial.keep, shots, views, engine=engine).cpu()
         self.trial, self.gaussians = trial, len(model.xyz)
         return trial.settings, left
