@@ -9,20 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from fragprune_plugins.constants import (
-    ALPHA_MIN,
-    FALLOFF_MIN,
-    FRUSTUM_MARGIN,
-    NEUTRAL_LOGIT,
-    RIM_REACH,
-    RIM_WIDTH,
-)
+from fragprune_plugins import constants
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import InputError, RanksError, UsageError
 from fragprune_plugins.files.model import Model
@@ -30,28 +23,20 @@ from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.slicing.cutting import slice_at
 from fragprune_plugins.slicing.splats import Moment, SpacetimeSplats
-from fragprune_plugins.types import RasterInputs, Splats, View
+from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View
 from fragprune_plugins.workbench.finetune.processes import Processes
 from fragprune_plugins.workbench.ranks import Ranks
 
-if TYPE_CHECKING:
-    from fragprune_plugins.types import RasterOutputs
-
-_SENT = ("means", "opacities", "scales", "rotations", "cov3d")
-"""Attributes that are sent as they are; colours and thresholds go with them."""
+_SENT = ("means", "opacities", "scales", "rotations", "cov3d")  # with colours and thresholds
 
 _SEEN, _POSE = ("width", "height", "tan_fov_x", "tan_fov_y"), ("viewmatrix", "projmatrix", "campos")
-_RULES = ("scale_modifier", "dilation", "near")
-"""What each process tells the others of its view and of its rules."""
-
-_WIDER, _BEYOND = 1.001, 1.0
-"""How much farther a Gaussian is taken to reach, for rounding: a factor, and pixels."""
-
+_RULES = ("scale_modifier", "dilation", "near")  # what each tells the others, beside its view
+_WIDER, _BEYOND = 1.001, 1.0  # a factor, and pixels: how much farther one may reach, by rounding
 _PER_GAUSSIAN = ("radii", "fragments_per_gaussian")
 
 
 class ShardedEngine:
-    """Rasterizes Gaussians that are divided among processes.
+    """Rasterizes Gaussians that are divided among processes, by an engine of one kind in all.
 
     ``rasterize`` is a collective operation. All processes call it, in the same order, each with its
     own Gaussians and with the view that it draws itself. The result is that view of the Gaussians
@@ -59,13 +44,8 @@ class ShardedEngine:
     one process. A backward pass is collective as well.
 
     Outputs with a row for each Gaussian have one for each of this process' own, in its own view.
-    Radii are 0 of those that reach none of its pixels.
-
-    Args:
-        engine: draws, and is of the same kind in all processes.
-
-    Attributes:
-        sent: Gaussians that this process has sent to others so far.
+    Radii are 0 of those that reach none of its pixels. ``sent`` counts the Gaussians that this
+    process has sent to others.
     """
 
     def __init__(self, engine: Engine, ranks: Ranks) -> None:
@@ -92,9 +72,8 @@ class ShardedEngine:
         rows = [reaching(each, splats, thresholds) for each in views]
         chosen = torch.cat(rows)
         parts = {name: each.index_select(0, chosen) for name, each in given.items()}
-        parts["colors"] = torch.cat(
-            [self._colors(splats, ids, at.view) for ids, at in zip(rows, views, strict=True)]
-        )
+        seen = zip(rows, views, strict=True)
+        parts["colors"] = torch.cat([self._colors(splats, ids, at.view) for ids, at in seen])
         rank, to = self.ranks.rank, [len(ids) for ids in rows]  # how many each gets of this one
         by = [counts[rank] for counts in self.ranks.gather(to)]  # and this one of each
         self.sent += sum(to) - to[rank]
@@ -127,20 +106,18 @@ class ShardedEngine:
         cut = max(kind[-1] for kind, _, _ in known)
         for rank, (kind, _, _) in enumerate(known):
             if kind[:-1] != kinds[:-1] or kind[-1] not in (0, cut):
-                raise RanksError(
-                    f"process {self.ranks.rank} of {self.ranks.size}",
-                    f"process {rank} draws Gaussians of another kind",
-                    f"the same of {', '.join(_SENT)} in all, with the same needs of gradients",
-                    "Call all with equal arguments but for the Gaussians and the view.",
-                )
+                where = f"process {self.ranks.rank} of {self.ranks.size}"
+                found = f"process {rank} draws Gaussians of another kind"
+                same = f"the same of {', '.join(_SENT)} in all, with the same needs of gradients"
+                remedy = "Call all with equal arguments but for the Gaussians and the view."
+                raise RanksError(where, found, same, remedy)
         if cut and "thresholds" not in given:
-            neutral = torch.full((len(inputs.splats),), NEUTRAL_LOGIT, device=inputs.splats.device)
-            given["thresholds"] = neutral.sigmoid().requires_grad_(cut > 1)
-        device = view.viewmatrix.device
-        return [
-            replace(inputs, view=replace(view, **seen).to(device), **rules)
-            for _, seen, rules in known
-        ]
+            neutral = torch.full((len(inputs.splats),), constants.NEUTRAL_LOGIT)
+            neutral = neutral.to(inputs.splats.device).sigmoid()
+            given["thresholds"] = neutral.requires_grad_(cut > 1)
+        at = view.viewmatrix.device
+        given_views = [(replace(view, **seen).to(at), rules) for _, seen, rules in known]
+        return [replace(inputs, view=each, **rules) for each, rules in given_views]
 
     def _colors(self, splats: Splats, ids: Tensor, view: View) -> Tensor:
         """(M, 3) RGB of chosen Gaussians as a view sees them."""
@@ -168,10 +145,8 @@ class ShardedEngine:
             if not group:
                 continue
             widths = [each.shape[1:].numel() for each in group.values()]
-            columns = [
-                each.reshape(-1, width) for each, width in zip(group.values(), widths, strict=True)
-            ]
-            table = torch.cat(columns, dim=1)
+            pairs = zip(group.values(), widths, strict=True)
+            table = torch.cat([each.reshape(-1, width) for each, width in pairs], dim=1)
             table = _Exchange.apply(table, self.ranks, to, by)  # type: ignore[no-untyped-call]
             for (name, each), piece in zip(group.items(), table.split(widths, dim=1), strict=True):
                 received[name] = piece.reshape(-1, *each.shape[1:])
@@ -204,9 +179,10 @@ def reaching(inputs: RasterInputs, splats: Splats, thresholds: Tensor | None) ->
     spread = means[:, :, None]  # no products of matrices, which may be those of TF32
     x, y, depth = ((spread * rotation).sum(1) + view.viewmatrix[3, :3]).unbind(1)
     clip = (spread * view.projmatrix[:3]).sum(1) + view.projmatrix[3]
-    q = 2 * (splats.opacities / ALPHA_MIN).log()
+    q = 2 * (splats.opacities / constants.ALPHA_MIN).log()
     if thresholds is not None and inputs.rim == "hard":  # a soft one reaches farther
-        rim = (thresholds - RIM_REACH * RIM_WIDTH).clamp_min(FALLOFF_MIN)
+        rim = thresholds - constants.RIM_REACH * constants.RIM_WIDTH
+        rim = rim.clamp_min(constants.FALLOFF_MIN)
         q = torch.minimum(q, -2 * torch.minimum(rim, thresholds).log())
     kept = (depth > inputs.near) & (q > 1 - _WIDER)
     q, largest = q.clamp_min(0), _largest_variance(inputs, splats)
@@ -215,7 +191,7 @@ def reaching(inputs: RasterInputs, splats: Splats, thresholds: Tensor | None) ->
         (0, x, view.width, view.tan_fov_x),
         (1, y, view.height, view.tan_fov_y),
     ):
-        limit, across = FRUSTUM_MARGIN * tan, rotation[:, axis]
+        limit, across = constants.FRUSTUM_MARGIN * tan, rotation[:, axis]
         slope = (place / depth).clamp(-limit, limit)
         steep = across @ across + slope * (slope * (forward @ forward) - 2 * (across @ forward))
         variance = largest * steep * (side / (2 * tan) / depth).square() + inputs.dilation
@@ -247,13 +223,10 @@ def _expect_sendable(inputs: RasterInputs) -> Splats:
         "sample_offsets": inputs.sample_offsets is not None,
         "scores": inputs.scores,
     }
-    if any(given.values()):
-        raise InputError(
-            "RasterInputs",
-            f"{', '.join(k for k, v in given.items() if v)}, and Gaussians divided among processes",
-            "3D Gaussians in space, without them",
-            "Draw in one process.",
-        )
+    if wrong := ", ".join(name for name, there in given.items() if there):
+        found = f"{wrong}, and Gaussians divided among processes"
+        expected = "3D Gaussians in space, without them"
+        raise InputError("RasterInputs", found, expected, "Draw in one process.")
     assert isinstance(splats, Splats)
     return splats
 
@@ -270,12 +243,10 @@ class Shards(Processes):
     def expect_able(self, settings: Settings) -> None:
         """Refuse views that cannot be divided, and an area that no process sees whole."""
         if settings.goal.on_area:
-            raise UsageError(
-                "finetune",
-                "portable, and Gaussians divided among processes",
-                "thresholds, or the whole model in each process",
-                "Leave --portable or --shard-gaussians out.",
-            )
+            found = "portable, and Gaussians divided among processes"
+            expected = "thresholds, or the whole model in each process"
+            remedy = "Leave --portable or --shard-gaussians out."
+            raise UsageError("finetune", found, expected, remedy)
         super().expect_able(settings)
 
     def _told(self, leaves: Sequence[Tensor]) -> list[Tensor]:
@@ -301,11 +272,8 @@ class Shards(Processes):
     def everywhere(self, rows: Tensor) -> Tensor:
         """The rows of all Gaussians, in each process."""
         size = self.ranks.size
-        return self.ranks.exchange(
-            rows.detach().repeat(size, *(1 for _ in rows.shape[1:])),
-            [len(rows)] * size,
-            self.counts,
-        )
+        copies = torch.cat([rows.detach()] * size)
+        return self.ranks.exchange(copies, [len(rows)] * size, self.counts)
 
     def whole(self, rows: Tensor) -> Tensor:
         """The rows of all Gaussians in the main memory of the first process; elsewhere none."""
@@ -324,20 +292,15 @@ def part_of(model: Model, ranks: Ranks, device: torch.device | str) -> Model:
 
     The model must be the same in all processes.
     """
-    count = len(model)
-    start, end = (count * rank // ranks.size for rank in (ranks.rank, ranks.rank + 1))
-    rows = torch.arange(count, device=model.device)
-    mask = (rows >= start) & (rows < end)
-    return model.keep(mask).to(device)
+    start, end = (len(model) * rank // ranks.size for rank in (ranks.rank, ranks.rank + 1))
+    rows = torch.arange(len(model), device=model.device)
+    return model.keep((rows >= start) & (rows < end)).to(device)
 
 
 def whole_of(model: Model, ranks: Ranks) -> Model:
     """The whole model, in the main memory of the first process, from everyone's part.
 
-    Other processes get one without Gaussians.
-
-    Raises:
-        RanksError: another process is gone.
+    Other processes get one without Gaussians. RanksError if another process is gone.
     """
     shards = Shards(ranks, len(model))
     rows: dict[str, Any] = {name: shards.whole(each) for name, each in model.tensors.items()}

@@ -11,17 +11,13 @@ from fragprune_plugins.learning.goals import Goal, Pressure, expect, number
 from fragprune_plugins.learning.pressure import PressureController, PressureRule
 from fragprune_plugins.learning.targets import Target
 
-TIME_FOLLOWS = 0.4
-"""d ln(frame time) / d ln(fragments), roughly: 0.3 in small pictures, 0.5 in large ones."""
+TIME_FOLLOWS = 0.4  # d ln(frame time) / d ln(fragments): 0.3 in small pictures, 0.5 in large ones
 
 
 @dataclass(frozen=True)
 class Faster(Goal):
-    """Draw frames so many times as fast.
-
-    Attributes:
-        ratio: frame time of the untruncated model as it came in over frame time now, on this
-            machine; above 1, up to 20.
+    """Draw frames so many times as fast: the frame time of the untruncated model as it came in over
+    that of now, on this machine; above 1, up to 20.
     """
 
     name: ClassVar[str] = "faster"
@@ -36,20 +32,16 @@ class Faster(Goal):
 
     def target(self) -> Target:
         """Refuse: whoever trains has to time frames."""
-        raise UsageError(
-            "target time",
-            "a training that cannot time single frames",
-            "a target in fragments",
-            "Aim for fewer fragments here, or use fragprune finetune on the trained PLY.",
-        )
+        found = "a training that cannot time single frames"
+        remedy = "Aim for fewer fragments here, or use fragprune finetune on the trained PLY."
+        raise UsageError("target time", found, "a target in fragments", remedy)
 
 
 @dataclass(frozen=True)
 class AtMost(Goal):
     """Truncate as strongly as a bound on the loss of quality allows; takes several trainings.
 
-    Attributes:
-        decibels: of PSNR lost against the control, 0 to 10.
+    The bound is in dB of PSNR against the control, 0 to 10.
     """
 
     name: ClassVar[str] = "at-most"
@@ -57,9 +49,8 @@ class AtMost(Goal):
 
     def __post_init__(self) -> None:
         if not 0 <= number("largest loss", self.decibels) <= 10:
-            raise UsageError(
-                "largest loss", f"{self.decibels:g}", "0 to 10 dB", "Choose another bound."
-            )
+            found = f"{self.decibels:g}"
+            raise UsageError("largest loss", found, "0 to 10 dB", "Choose another bound.")
 
     def pressure(self, elasticity: float, itself: bool) -> PressureRule:
         """That of the first training with thresholds."""
@@ -67,12 +58,9 @@ class AtMost(Goal):
 
     def target(self) -> Target:
         """Refuse: the bound is one for several trainings."""
-        raise UsageError(
-            "largest loss",
-            "one training",
-            "several, of which the strongest truncation within the bound is chosen",
-            "Use fragprune finetune on the trained PLY.",
-        )
+        expected = "several, of which the strongest truncation within the bound is chosen"
+        remedy = "Use fragprune finetune on the trained PLY."
+        raise UsageError("largest loss", "one training", expected, remedy)
 
 
 def parse_goal(text: str) -> Goal:

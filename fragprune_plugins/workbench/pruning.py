@@ -18,20 +18,16 @@ from fragprune_plugins.plugins.hooks import engine_for
 from fragprune_plugins.types import RasterInputs, View
 from fragprune_plugins.workbench.scenes.dataset import Shot
 
-Keep = float | Literal["auto", "visible"]
-"""The Gaussians to keep (``--keep``): a share of them, or a rule."""
+Keep = float | Literal["auto", "visible"]  # what ``--keep`` leaves: a share, or a rule
 
 SPARE = 0.005
-"""Share of the squared error up to which ``keep_needed`` removes.
-
-Errors of neighbours add up, so it rises by more than that, and learning makes up for it: 14 %, 15 %
-and 30 % of the Gaussians of three scenes went for 0.03 dB or less.
-"""
+"""Share of the squared error up to which ``keep_needed`` removes. Errors of neighbours add up, so
+it rises by more, and learning makes up for it: 14 %, 15 % and 30 % of the Gaussians of three scenes
+went for 0.03 dB or less."""
 
 LEAST = 0.6
 """Share of the Gaussians that ``keep_needed`` leaves at least: where the error is large, as in the
-first steps of a training, single changes say little of what many of them do together.
-"""
+first steps of a training, single changes say little of what many of them do together."""
 
 
 def kept(
@@ -44,12 +40,11 @@ def kept(
     progress: bool = False,
     scores: Tensor | None = None,
 ) -> Tensor:
-    """(N,) bool: the Gaussians that ``--keep`` leaves of N.
+    """(N,) bool: the Gaussians that ``--keep`` leaves, by views whose pictures must not change.
 
     Args:
         keep: a share of them in (0, 1]; "auto" for what ``keep_needed`` leaves, or "visible".
         shots: the photographs to learn from, on the model's device.
-        views: whose pictures must not change.
         scores: (N,) of these views, if they are known (``scored``).
 
     Raises:
@@ -99,14 +94,11 @@ def keep_best(
 ) -> Model:
     """Copy a model without the Gaussians of the least ``removal_error``.
 
-    Thresholds keep their moments.
+    Thresholds keep their moments. With ``progress`` a bar is drawn on stderr.
 
     Args:
-        model: N Gaussians and their thresholds.
         share: of the Gaussians to keep, in (0, 1]; at least one is kept.
         views: to score them on, on the model's device.
-        engine: a name or an engine.
-        progress: draw a bar on stderr.
 
     Raises:
         InputError: the share is not in (0, 1].
@@ -126,27 +118,18 @@ def keep_needed(
 
     Those of the least ``removal_error`` go, until the errors of a view add up to ``SPARE`` of the
     squared error of the whole model in a photograph, or ``LEAST`` of the Gaussians are left.
-    Thresholds keep their moments.
+    Thresholds keep their moments. With ``progress`` a bar is drawn on stderr.
 
     Args:
-        model: N Gaussians and their thresholds.
         shots: the photographs to learn from, on the model's device.
         views: whose pictures must not change; those of the photographs when empty.
-        engine: a name or an engine.
-        progress: draw a bar on stderr.
     """
     views = views or [shot.view for shot in shots]
     return model.keep(kept(model, "auto", shots, views, engine=engine, progress=progress))
 
 
 def best(scores: Tensor, share: float) -> Tensor:
-    """(N,) bool: the share of the Gaussians that has the largest scores (N,), rounded to a number.
-
-    Of equal scores the first rows stay, so that as many are kept as were asked for.
-
-    Raises:
-        InputError: the share is not in (0, 1].
-    """
+    """(N,) bool: the share in (0, 1] with the largest scores (N,); of equal ones the first rows."""
     if not 0 < share <= 1:
         raise InputError("share", f"{share:g}", "0 < X <= 1", "Choose one, such as 0.6.")
     count = max(1, round(share * len(scores)))
@@ -161,8 +144,7 @@ def removal_error(model: Model, views: Iterable[View], engine: Engine) -> Tensor
     A pixel is linear in a fragment's alpha, so its change is alpha times the gradient by alpha.
     The sum of squares over pixels is the mean square of gradients by the opacity of pictures
     whose values have random signs (Hutchinson's estimator): one backward pass a view, on any
-    engine. Views that see a Gaussian make up for the few passes, so give many. A pixel's stop at
-    little transmittance is left out.
+    engine, so give many views. A pixel's stop at little transmittance is left out.
     """
     splats = model.splats()
     opacities = splats.opacities.detach().clone().requires_grad_(True)
@@ -182,13 +164,12 @@ def removal_error(model: Model, views: Iterable[View], engine: Engine) -> Tensor
 
 @torch.no_grad()
 def visible(model: Model, views: Sequence[View] = (), *, engine: str | Engine = "auto") -> Tensor:
-    """(N,) bool: the Gaussians whose removal could change a picture.
+    """(N,) bool: the Gaussians whose removal could change a picture; InputError if there is none.
 
-    Without views, these are the Gaussians with an opacity of 1/255 or more. With views, these are
-    the Gaussians that reach the centre of a pixel in at least one view, hidden by others or not.
-    Without the other Gaussians, the pictures of the views are the same to the bit if activated
-    values are. (torch.sigmoid may round an opacity differently in another row.) The model's own
-    thresholds count, not the answers of plugins. If no Gaussian is visible, it raises InputError.
+    Without views, these have an opacity of 1/255 or more. With views, they reach the centre of a
+    pixel in one of them, hidden by others or not; without the rest the pictures are the same to the
+    bit if activated values are (torch.sigmoid may round differently in another row). The model's
+    own thresholds count, not the answers of plugins.
     """
     splats = model.splats()
     seen = splats.opacities >= ALPHA_MIN
@@ -203,10 +184,6 @@ def visible(model: Model, views: Sequence[View] = (), *, engine: str | Engine = 
             assert counts is not None
             seen |= counts > 0
     if not seen.any():
-        raise InputError(
-            "model",
-            f"none of {len(model)} Gaussians reaches a pixel",
-            "some that do",
-            "Check that model and views belong together.",
-        )
+        found, expected = f"none of {len(model)} Gaussians reaches a pixel", "some that do"
+        raise InputError("model", found, expected, "Check that model and views belong together.")
     return seen

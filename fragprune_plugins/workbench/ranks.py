@@ -22,13 +22,8 @@ if TYPE_CHECKING:
     import torch
 
 Each = TypeVar("Each")
-
-OLDEST = "2.5"
-"""Release of torch with which several processes were tried."""
-
-PATIENCE = 600.0
-"""Seconds to wait for the other processes before this one ends with an error."""
-
+OLDEST = "2.5"  # release of torch with which several processes were tried
+PATIENCE = 600.0  # seconds to wait for the other processes before this one ends with an error
 _PIECE = 1 << 22  # numbers of a tensor that are summed at once
 
 
@@ -37,12 +32,9 @@ class Ranks:
     """All processes of one learning, seen from one of them; by default there is one.
 
     What they do together raises RanksError if another process is gone.
-
-    Attributes:
-        rank: of this process, from 0.
     """
 
-    rank: int = 0
+    rank: int = 0  # of this process
     size: int = 1
 
     @property
@@ -66,12 +58,7 @@ class Ranks:
                 dist.all_reduce(tensor)
 
     def exchange(self, rows: torch.Tensor, to: list[int], by: list[int]) -> torch.Tensor:
-        """Send rows (M, ...) to each process, and receive rows of each, by rank.
-
-        Args:
-            to: how many each process gets of this one.
-            by: how many this one gets of each.
-        """
+        """Send rows (M, ...), ``to`` so many each process, and receive ``by`` so many, by rank."""
         if not self.several:
             return rows
         received = rows.new_empty(sum(by), *rows.shape[1:])
@@ -122,15 +109,17 @@ class Ranks:
 
 def launched() -> Ranks:
     """What a launcher such as ``torchrun`` says in the environment."""
-    rank, size = os.environ.get("RANK", ""), os.environ.get("WORLD_SIZE", "")
-    if not size.isdigit() or int(size) < 2:
-        return Ranks()
-    return Ranks(int(rank) if rank.isdigit() else 0, int(size))
+    size = _told("WORLD_SIZE")
+    return Ranks(_told("RANK"), size) if size > 1 else Ranks()
 
 
 def local_rank() -> int:
     """The number of this process among those of its machine: which GPU it takes."""
-    said = os.environ.get("LOCAL_RANK", "")
+    return _told("LOCAL_RANK")
+
+
+def _told(name: str) -> int:
+    said = os.environ.get(name, "")
     return int(said) if said.isdigit() else 0
 
 
@@ -138,8 +127,7 @@ def local_rank() -> int:
 def joined(device: torch.device) -> Iterator[Ranks]:
     """Inside, the processes that were launched together can exchange tensors of a device.
 
-    Raises:
-        RanksError: they do not find each other, or torch is too old.
+    RanksError if they do not find each other, or torch is too old.
     """
     ranks = launched()
     if not ranks.several:
@@ -159,10 +147,8 @@ def joined(device: torch.device) -> Iterator[Ranks]:
     if device.type == "cuda":
         torch.cuda.set_device(device)
     try:
-        dist.init_process_group(
-            "cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo",
-            timeout=timedelta(seconds=PATIENCE),
-        )
+        backend = "cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo"
+        dist.init_process_group(backend, timeout=timedelta(seconds=PATIENCE))
     except (RuntimeError, ValueError) as error:
         raise RanksError(
             "learning",

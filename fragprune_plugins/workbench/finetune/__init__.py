@@ -85,7 +85,7 @@ RULES = (
     "learns; visible keeps what reaches a pixel of any view. "
     "--target-speedup counts from what is left.",
 )
-@click.option("--seed", type=int, default=0, show_default=True, help="Seed of the order of views.")
+@click.option("--seed", type=int, default=0, help="Seed of the order of views.")
 @click.option(
     "--views-per-step",
     type=click.IntRange(min=1),
