@@ -6,6 +6,7 @@ and draws; strategies change rows through a handful of functions that treat ever
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Hashable, Iterator, Mapping
 from contextlib import contextmanager
@@ -127,12 +128,23 @@ def splats_in(saved: Any) -> Splats | None:
     return None
 
 
+def place(call: SeamCall) -> Any:
+    """The path of the file that ``torch.save`` or ``torch.load`` got, or has open; else None."""
+    file = call.arguments["f"]
+    plain = io.BufferedReader, io.BufferedWriter, io.BufferedRandom, io.FileIO
+    file = file.name if isinstance(file, plain) else file
+    return file if isinstance(file, str | os.PathLike) else None
+
+
+def exported(call: SeamCall) -> Any:
+    """Where ``export_splats`` writes; None for the formats but PLY, which sort their rows."""
+    return call.arguments["save_to"] if call.arguments["format"] == "ply" else None
+
+
 def read_again(call: SeamCall) -> tuple[Path, Tensor] | None:
     """The file and its means, if ``torch.load`` read parameters from one."""
-    file, splats = call.arguments["f"], splats_in(call.result)
-    if splats is None or not isinstance(file, str | os.PathLike):
-        return None
-    return Path(file), splats["means"].detach().cpu()
+    file, splats = place(call), splats_in(call.result)
+    return (Path(file), splats["means"].detach().cpu()) if splats and file else None
 
 
 def _operation(name: str, *needs: str) -> Seam:
@@ -177,9 +189,9 @@ class Gsplat(HostAdapter):
         answered("relocation", "compute_relocation", *RELOCATED, by="relocation"),
         answered("cuda._wrapper", "quat_scale_to_covar_preci", *SHAPED, by="covariance"),
         answered("distributed", "cli", "fn", "args", by="alone"),
-        Seam(Role.SAVE, "torch", "save", ("f", "obj"), external=True),
+        Seam(Role.SAVE, "torch", "save", ("f", "obj"), external=True, how=place),
         Seam(Role.UNPACK, "torch", "load", ("f",), external=True, how=read_again),
-        Seam(Role.SAVE, EXPORTER, "export_splats", ("save_to", "means", "format")),
+        Seam(Role.SAVE, EXPORTER, "export_splats", ("save_to", "means", "format"), how=exported),
     )
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
@@ -225,10 +237,7 @@ class Gsplat(HostAdapter):
 
         given = call.arguments
         if "obj" in given or "save_to" in given:  # of torch.save, and of export_splats
-            # torch.save takes an open file too, and the formats but PLY sort their rows
-            paired = isinstance(given.get("f", ""), str | os.PathLike)
-            paired &= given.get("format", "ply") == "ply"
-            return splats_in(given.get("obj", given)) if paired else None
+            return splats_in(given.get("obj", given))
         params = given.get("params", given.get("means"))
         if isinstance(params, dict):
             found = "a plain dict, which cannot hold a session's state"

@@ -176,4 +176,5 @@ for step in range(args.steps + args.stage2):
 print(f"{args.steps + args.stage2} steps: {held_out():.3f} dB")
 export("finetuned")
 summary = session.finish()  # 3. what was gained, over the training views
-print(f"fragments per pixel: {summary.fragments_before} -> {summary.fragments_after}")
+if not args.control:
+    print(f"fragments per pixel: {summary.fragments_before} -> {summary.fragments_after}")

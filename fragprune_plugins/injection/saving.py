@@ -22,15 +22,20 @@ from fragprune_plugins.learning.thresholds import ThresholdStore
 
 def on_save(session: SessionState, call: SeamCall) -> Any:
     """Have the host write its file aside, then put file and sidecar in place, both at once."""
-    model, state = learner(session, call)
-    if state is None or call.first is None:
+    (model, state), file = learner(session, call), call.how(call.first)
+    if file is None or state is None or hasattr(call.first, "flush"):  # an open file stays in place
         result = call.run()
-        if not (session.learn or call.first is None):
-            sidecar.path_beside(Path(call.how(call.first))).unlink(missing_ok=True)
+        if file is not None and state is not None:
+            call.first.flush()
+            session.save(model, Path(file))
+        elif file is not None and not session.learn:
+            sidecar.path_beside(Path(file)).unlink(missing_ok=True)
+        elif state is not None and state.store.cuts:
+            log.warning("%s: without cutoffs: pass the path of a file", call.seam)
         return result
-    path, given = Path(call.how(call.first)), Path(call.first)
+    path = Path(file)
     with staging(path) as folder:
-        aside = type(call.first)(folder / given.name)
+        aside = type(call.first)(folder / Path(call.first).name)
         result = call.run(**{call.seam.needs[0]: aside})
         for other in [f for f in folder.rglob("*") if f.is_file() and f != folder / path.name]:
             beside = path.parent / other.relative_to(folder)
@@ -51,8 +56,7 @@ def learner(session: SessionState, call: SeamCall) -> tuple[Any, ModelState | No
                 model = known
                 break
         else:
-            said = "%s: without cutoffs: no model that learns has exactly these Gaussians"
-            log.warning(said, call.seam)
+            log.warning("%s: without cutoffs: no learning model has these Gaussians", call.seam)
     state = session.models.get(model)
     if state is not None and state.stage is not None and state.stage.plan is not None:
         state.stage.check()
@@ -74,13 +78,12 @@ def on_load(session: SessionState, call: SeamCall) -> Any:
 
 def on_pack(session: SessionState, call: SeamCall) -> Any:
     """Write the sidecar of a packed file, with rows in the file's order."""
-    result = call.run()
-    packed = call.how()
-    model = session.last() if session.last else None
-    state = session.models.get(model) if model is not None else None
+    result, packed = call.run(), call.how()
     if packed is None:
         return result
     (path, rows), store = packed, None
+    model = session.last() if session.last else None
+    state = session.models.get(model) if model is not None else None
     if state is not None and state.store.cuts:
         if rows.ndim > 1:
             rows = rows_of(rows, session.adapter.means(model), str(call.seam))

@@ -78,7 +78,7 @@ def test_a_copy_that_is_another_model_by_now_is_saved_loudly(tmp_path, caplog):
         best.save_ply(str(path))
         best.capture()
     assert not sidecar.find(path)
-    said = "without cutoffs: no model that learns has exactly these Gaussians"
+    said = "without cutoffs: no learning model has these Gaussians"
     places = [f"GaussianModel.{each}" for each in ("save_ply", "capture")]
     assert all(f"{at}: {said}" in m for at, m in zip(places, caplog.messages, strict=True))
 

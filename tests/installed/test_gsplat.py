@@ -1,6 +1,7 @@
 """The real gsplat on the CPU, where only our kernels answer."""
 
 import contextlib
+import gzip
 import inspect
 import io
 import json
@@ -450,18 +451,25 @@ SAVED = {
 
 
 @pytest.mark.parametrize("form", SAVED)
-@pytest.mark.parametrize("learn", [True, False])
-def test_torch_saves_and_loads_parameters_with_thresholds(session_on, tmp_path, form, learn):
+@pytest.mark.parametrize(("learn", "opened"), [(True, False), (False, False), (False, True)])
+def test_torch_saves_and_loads_parameters_with_thresholds(
+    session_on, tmp_path, form, learn, opened
+):
     file, logits = tmp_path / "splats.pt", torch.randn(40)
 
+    def at(mode):
+        return file.open(mode) if opened else contextlib.nullcontext(file)
+
     def loaded():
-        saved = torch.load(file)
+        with at("rb") as source:
+            saved = torch.load(source)
         return saved if "means" in saved else next(reversed(saved.values()))
 
     with session_on(Gsplat()) as session:
         params, _ = attached()
         session.store(params).logits = logits.clone().requires_grad_(True)
-        torch.save(SAVED[form](params), file)
+        with at("wb") as target:
+            torch.save(SAVED[form](params), target)
         with torch.no_grad():
             picture = draw(params)[0]
     with session_on(Gsplat(), learn=learn) as session:
@@ -481,6 +489,19 @@ def test_torch_saves_and_loads_parameters_with_thresholds(session_on, tmp_path, 
         torch.save(saved, io.BytesIO())  # neither a file nor all parameters
 
 
+def test_what_can_have_no_sidecar_is_saved_loudly(session_on, tmp_path, caplog):
+    with session_on(Gsplat()) as session:
+        params, _ = attached()
+        torch.save(params.state_dict(), io.BytesIO())
+        assert not caplog.messages
+        session.store(params).logits = torch.randn(40).requires_grad_(True)
+        with gzip.open(tmp_path / "splats.pt.gz", "wb") as file:
+            torch.save(params.state_dict(), file)
+    (said,) = caplog.messages
+    assert said == "torch:save: without cutoffs: pass the path of a file"
+    assert len(list(tmp_path.iterdir())) == 1
+
+
 @pytest.mark.parametrize("name", ["means", "opacities"])
 def test_copies_of_other_gaussians_are_saved_loudly(session_on, tmp_path, caplog, name):
     """Which thresholds were theirs is not known: those of the model have learned since."""
@@ -489,9 +510,8 @@ def test_copies_of_other_gaussians_are_saved_loudly(session_on, tmp_path, caplog
         best = copied(params)
         params[name].data += 0.1
         torch.save(best, tmp_path / "best.pt")
-        torch.save(best, io.BytesIO())
     (said,) = caplog.messages
-    assert said.startswith("torch:save: without cutoffs: no model that learns has exactly these")
+    assert said.startswith("torch:save: without cutoffs: no learning model has these")
     assert not sidecar.find(tmp_path / "best.pt")
 
 
@@ -544,7 +564,9 @@ def documented(folder: str, words: list[str]) -> str:
 def test_the_documented_loop_runs_and_exports_thresholds(folder, photographs, tmp_path, strategy):
     def loop(*words: object) -> None:
         words = (LOOP, photographs, *words, "--strategy", strategy)
-        assert "fragments per pixel" in fresh(documented, str(folder), [str(w) for w in words])
+        said = fresh(documented, str(folder), [str(w) for w in words])
+        assert ("fragments per pixel" in said) != ("--control" in words)
+        assert "None" not in said
 
     loop(tmp_path, "--steps", 6, "--stage2", 6)
     before, after = (read_ply(tmp_path / f"{name}.ply") for name in ("trained", "finetuned"))
@@ -558,3 +580,4 @@ def test_the_documented_loop_runs_and_exports_thresholds(folder, photographs, tm
         loop(tmp_path / "again", "--start", tmp_path / "trained.ply", "--stage2", 3)
         again = sidecar.load(tmp_path / "again" / "finetuned.ply")[0]
         assert (len(again), again.steps) == (len(before.xyz), 3)
+        loop(tmp_path / "again", "--start", tmp_path / "trained.ply", "--stage2", 3, "--control")

@@ -65,9 +65,9 @@ def test_an_absent_file_is_a_reason(monkeypatch):
 
 
 def test_a_broken_file_is_a_reason_not_a_crash(monkeypatch, tmp_path):
-    broken = tmp_path / "broken.so"
-    broken.write_bytes(b"not a library")
-    monkeypatch.setattr(binding, "_path_of", lambda build: str(broken))
+    for build in binding.usable_builds():
+        (tmp_path / f"_cpu_{build}{binding._SUFFIX}").write_bytes(b"not a library")
+    monkeypatch.setattr(binding.native, "__file__", str(tmp_path / "__init__.py"))
     assert "cannot be opened" in binding.chosen()
 
 

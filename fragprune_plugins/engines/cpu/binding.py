@@ -158,17 +158,11 @@ class Unavailable(Exception):  # noqa: N818 - a state of this machine
     """No build can be used here; the message says why."""
 
 
-def _path_of(build: str) -> str:
-    """The path of a build's file. The file is not a Python module and is not imported."""
-    path = Path(native.__file__).with_name(f"_cpu_{build}{_SUFFIX}")
-    if not path.is_file():
-        raise Unavailable(f"the {build} build is not installed (was there a C++17 compiler?)")
-    return str(path)
-
-
 def open_build(build: str) -> Library:
-    """Open one build and check the version of its interface."""
-    path = _path_of(build)
+    """Open one build, whose file is no Python module, and check the version of its interface."""
+    path = str(Path(native.__file__).with_name(f"_cpu_{build}{_SUFFIX}"))
+    if not os.path.isfile(path):
+        raise Unavailable(f"the {build} build is not installed (was there a C++17 compiler?)")
     try:
         calls = ctypes.CDLL(path)
         version = int(calls.fragprune_version())
