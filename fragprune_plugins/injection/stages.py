@@ -351,12 +351,12 @@ class Stages:
             expected = f"iterations after {start}, where {where}"
             remedy = f"{flag}, or lower --from-iter." if start > resumed else f"{flag}."
             raise UsageError(f"--stage {self.options.stage}", found, expected, remedy)
-        steps = end - (resumed if joint else start)
-        settings = self.settings = replace(self.options.settings, iterations=steps)
+        settings = self.settings = replace(self.options.settings, iterations=end - start)
         origin = Path(file) if file and start == resumed else None
         options: dict[str, Any] = {"from_step": start - resumed, "origin": origin}
         if joint:
             log.info("thresholds learn in iterations %d to %d", start + 1, total)
+            settings = replace(settings, iterations=end - resumed)
             schedule = JointSchedule(settings, start - resumed + 1)
             options = {"freeze": False, "schedule": schedule}
         arguments, began = self.host.saving(self.scratch, total, **self._apart()), time.time() - 0.1

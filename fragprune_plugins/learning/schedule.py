@@ -183,6 +183,8 @@ class Schedule:
         warmup: steps without truncation; ``Settings.warmup`` when None.
     """
 
+    from_step = 1  # the first that learns
+
     def __init__(self, settings: Settings, warmup: int | None = None) -> None:
         self.settings = settings
         self.warmup = settings.warmup if warmup is None else warmup

@@ -326,7 +326,7 @@ class Stage2:
             ratio = figures.get(target.figure)
             reached = ratio is not None and abs(target.ratio / ratio - 1) <= targets.TOLERANCE
         return Progress(
-            steps=self.taken,
+            steps=max(0, self.taken + 1 - self.schedule.from_step),
             gaussians=len(self.store),
             fragments_before=before,
             fragments_after=after,
