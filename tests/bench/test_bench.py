@@ -156,10 +156,24 @@ def test_every_size_and_count() -> None:
         fragments = row["fragments_per_pixel"] / other["fragments_per_pixel"]
         time = row["ms_median"] / other["ms_median"]
         ratios = {"fragments": fragments, "time": time, "share": time / fragments}
-        assert saved[f"{row['scene']} {row['width']}x{row['height']}"] == pytest.approx(ratios)
+        entry = saved[f"{row['scene']} {row['width']}x{row['height']}"]
+        assert set(entry) == {*ratios, "time_se", "beyond_noise"}
+        assert {name: entry[name] for name in ratios} == pytest.approx(ratios)
     assert set(found["machine"]) == {
         *("processor", "cores", "load_before", "load_after", "platform", "torch", "native", "gpu")
     }
+
+
+@pytest.mark.parametrize(
+    ("ms", "said"),
+    [(20, " 1.50 ± 0.04x as fast (75% of it)"), (29, ": no difference beyond the noise")],
+)
+def test_a_ratio_of_times_is_quoted_beyond_the_noise_alone(ms: float, said: str) -> None:
+    same = {"scene": "s", "width": 8, "height": 6, "pass": "forward", "ms_se": 0.4}
+    plain = {"ms_median": 30, "fragments_per_pixel": 50}
+    cut = {"ms_median": ms, "fragments_per_pixel": 25}
+    (saved,) = work._saved([same | plain, same | cut]).values()
+    assert work._phrase(saved) == f"2.00x fewer fragments, frames{said}"
 
 
 def test_the_text_says_what_was_saved_and_how_busy_the_machine_was() -> None:

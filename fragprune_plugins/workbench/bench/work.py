@@ -16,6 +16,7 @@ from fragprune_plugins.plugins.hooks import thresholds_for
 from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.bench import timing
 from fragprune_plugins.workbench.commands import command, opening, options
+from fragprune_plugins.workbench.figures.wording import WITHIN_NOISE, faster
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
 from fragprune_plugins.workbench.scenes.output import cameras_of
@@ -68,16 +69,26 @@ def _of_model(
     return cases
 
 
-def _saved(results: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
+def _saved(results: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
     """By "scene WIDTHxHEIGHT": ratios of fragments and of time, forward; time over fragments."""
     forward, found = [row for row in results if row["pass"] == "forward"], {}
-    for plain, cut in zip(forward[::2], forward[1::2], strict=True):
-        if cut["fragments_per_pixel"] > 0:
-            fragments = plain["fragments_per_pixel"] / cut["fragments_per_pixel"]
-            time = plain["ms_median"] / cut["ms_median"]
-            name = "{scene} {width}x{height}".format(**plain)
-            found[name] = {"fragments": fragments, "time": time, "share": time / fragments}
+    for rows in zip(forward[::2], forward[1::2], strict=True):
+        plain, cut = (row["fragments_per_pixel"] for row in rows)
+        if cut > 0:
+            frames = ({"frame_ms": r["ms_median"], "frame_ms_se": r["ms_se"]} for r in rows)
+            time, error, differs = faster(*frames)
+            name = "{scene} {width}x{height}".format(**rows[0])
+            found[name] = {"fragments": plain / cut, "time": time, "time_se": error}
+            found[name] |= {"beyond_noise": differs, "share": time * cut / plain}
     return found
+
+
+def _phrase(saved: dict[str, Any]) -> str:
+    """What was saved; of times that differ by no more than their noise there is no ratio."""
+    time = f": {WITHIN_NOISE}"
+    if saved["beyond_noise"]:
+        time = " {time:.2f} ± {time_se:.2f}x as fast ({share:.0%} of it)".format(**saved)
+    return f"{saved['fragments']:.2f}x fewer fragments, frames{time}"
 
 
 def _table(data: dict[str, Any]) -> str:
@@ -98,11 +109,7 @@ def _table(data: dict[str, Any]) -> str:
         if r["stages"]:
             parts = ", ".join(f"{name} {ms:.2f}" for name, ms in r["stages"].items())
             lines.append(f"{'':<29}{parts}")
-    for name, saved in data["saved"].items():
-        lines.append(
-            f"{name}: {saved['fragments']:.2f}x fewer fragments, "
-            f"frames {saved['time']:.2f}x as fast ({100 * saved['share']:.0f}% of it)"
-        )
+    lines += [f"{name}: {_phrase(saved)}" for name, saved in data["saved"].items()]
     first, loads = results[0], "load unknown on this system"
     if machine["load_before"] is not None:
         loads = f"load {machine['load_before']:.1f} to {machine['load_after']:.1f}"

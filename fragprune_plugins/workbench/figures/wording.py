@@ -16,6 +16,7 @@ from fragprune_plugins.workbench.goals import Faster, parse_goal
 
 _EQUAL = 0.005  # a ratio of fragments that reads 1.00
 CLAIMED = 2  # frame times count as different if they differ by this many standard errors
+WITHIN_NOISE = "no difference beyond the noise"
 FELL = 0.5  # a loss of PSNR, in dB, that is warned of
 
 CONTROLLED_BY = {
@@ -91,7 +92,7 @@ def tabulate(columns: Mapping[str, dict[str, Any]]) -> list[list[str]]:
             if key in _DIFFERENCES:
                 cells.append(f"{last - first:+.{digits}f}")
             elif key == "frame_ms":
-                ratio, _, claimed = _faster(*reports[-2:])
+                ratio, _, claimed = faster(*reports[-2:])
                 cells.append(f"{ratio:.2f}x as fast" if claimed else "within noise")
             else:
                 cells.append(_less(first, last, "less" if key == "area_per_pixel" else "fewer"))
@@ -179,11 +180,11 @@ def headlines(data: Mapping[str, Any], control: dict[str, Any] | None) -> list[t
     """Fragments, frame time, picture of a fine-tuning: (the figure, what it says) of each."""
     before, after = data["before"], data["after"]
     slow, fast = (each["frame_ms"] for each in (before, after))
-    faster, _, claimed = _faster(before, after)
+    ratio, _, claimed = faster(before, after)
     if claimed:
-        frame = f"{faster:.2f}x", f"as fast: frames in {slow:.2f} → {fast:.2f} ms"
+        frame = f"{ratio:.2f}x", f"as fast: frames in {slow:.2f} → {fast:.2f} ms"
     else:  # no ratio: a busy machine tells none
-        frame = f"{slow:.1f} → {fast:.1f} ms", "for frames: no difference beyond the noise"
+        frame = f"{slow:.1f} → {fast:.1f} ms", f"for frames: {WITHIN_NOISE}"
     if after.get("target") == ITSELF:
         figure = "equal" if _same(after) else f"{after['psnr']:.1f} dB"
         against = "of the picture against the original's own"
@@ -313,13 +314,13 @@ def _less(before: float, after: float, word: str = "fewer") -> str:
 
 def frames(before: dict[str, Any], after: dict[str, Any], enlarge: int = 1) -> str:
     """A phrase for frame times, with their ratio only if it exceeds the standard errors."""
-    ratio, error, claimed = _faster(before, after)
-    faster = f"{ratio:.2f} ± {error:.2f}x as fast" if claimed else "no difference beyond the noise"
+    ratio, error, claimed = faster(before, after)
+    change = f"{ratio:.2f} ± {error:.2f}x as fast" if claimed else WITHIN_NOISE
     of = f" of {enlarge}x the size" if enlarge > 1 else ""
-    return f"frames{of} {before['frame_ms']:.2f} -> {after['frame_ms']:.2f} ms ({faster})"
+    return f"frames{of} {before['frame_ms']:.2f} -> {after['frame_ms']:.2f} ms ({change})"
 
 
-def _faster(before: dict[str, Any], after: dict[str, Any]) -> tuple[float, float, bool]:
+def faster(before: dict[str, Any], after: dict[str, Any]) -> tuple[float, float, bool]:
     """How many times as fast frames are, its standard error, and whether that is a difference."""
     times = [max(report["frame_ms"], 1e-9) for report in (before, after)]
     errors = [report["frame_ms_se"] for report in (before, after)]
