@@ -10,6 +10,7 @@ from cli.commands import run_json
 from finetune import tiny
 
 from fragprune_plugins.engines import create_engine
+from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
 from fragprune_plugins.workbench.finetune import trial
 from fragprune_plugins.workbench.finetune.trial import BY_HEART, DROPOUT, KEEP, forgotten
@@ -124,6 +125,23 @@ def test_the_trial_chooses_what_nobody_chose(command, found, options, dropout, k
     assert report["forgotten"] == found
     share = report["after"]["gaussians"] / 60
     assert share < 1 if keep == "auto" else share == (keep or 1)
+
+
+@pytest.mark.parametrize(
+    ("lost", "said"),
+    [
+        (BY_HEART, "it does, so it learns with dropout 0.2 and without four in ten Gaussians"),
+        (0.0, "it does not, so it learns without Gaussians that its photographs can spare"),
+    ],
+)
+def test_the_trial_says_what_follows_and_names_no_option(
+    model, photographs, engine, monkeypatch, lost, said
+):
+    """``run``, which makes it too, has not all of ``finetune``'s options."""
+    heard = []
+    monkeypatch.setattr(trial, "forgotten", lambda *_, **__: lost)
+    trial.tried(model, photographs, Settings(), engine=engine, say=heard.append)
+    assert heard[-1].endswith(said)
 
 
 def test_of_a_pruned_model_no_gaussian_is_removed(command, tmp_path):

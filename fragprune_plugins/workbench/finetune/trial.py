@@ -67,11 +67,13 @@ def tried(
         return asked
     by_heart = lost >= BY_HEART
     whole = model.falloff is None and not isinstance(settings.goal, Fewer | Faster)
+    learns = [f"with dropout {DROPOUT:g}"] * by_heart
     if keep is None and whole:
         keep = KEEP if by_heart else "auto"
-    options = [f"--dropout {DROPOUT:g}"] * by_heart + [f"--keep {keep}"] * (keep is not None)
+        which = "four in ten Gaussians" if by_heart else "Gaussians that its photographs can spare"
+        learns.append(f"without {which}")
     told = f"they change the others by {-lost:+.2f} dB: it does" + ("" if by_heart else " not")
-    say(f"{told}, so {' '.join(options)}" if options else told)
+    say(f"{told}, so it learns {' and '.join(learns)}" if learns else told)
     dropout = DROPOUT if by_heart else None
     return Trial(replace(settings, dropout=dropout), keep, lost)
 
