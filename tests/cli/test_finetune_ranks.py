@@ -156,7 +156,7 @@ OFTEN = """
 from fragprune_plugins.workbench.commands import main
 from fragprune_plugins.workbench.finetune import resuming
 
-resuming.EVERY = 0.001
+resuming.EVERY = 0.0
 main()
 """
 LAUNCHER = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2"]
@@ -179,7 +179,7 @@ def test_torchrun_itself_ends_when_one_is_killed_and_goes_on(tuning, tmp_path):
         said, error = run_.communicate(timeout=60)
     assert run_.returncode == 1
     assert said == ""
-    assert error.count("[ranks]") == 1
+    assert error.count("[ranks]") <= 1  # none where the launcher ends the other one sooner
     assert f"exitcode  : -9 (pid: {last})" in error
     assert not out.exists()
     done = subprocess.run(line, capture_output=True, text=True, timeout=200)
