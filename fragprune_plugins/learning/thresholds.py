@@ -79,11 +79,12 @@ class ThresholdStore:
         Raises:
             InputError: they are not (N,) floating-point numbers in (0, 1).
         """
-        inside = thresholds.ndim == 1 and thresholds.is_floating_point()
+        inside = isinstance(thresholds, Tensor) and thresholds.ndim == 1
+        inside = inside and thresholds.is_floating_point()
         if not inside or not bool(((thresholds > 0) & (thresholds < 1)).all()):
             found = short(thresholds) + (", some outside (0, 1)" if inside else "")
             remedy = "Correct them; ThresholdStore.from_alpha takes a limit of alpha."
-            raise InputError("thresholds", found, "(N,) falloff in (0, 1)", remedy)
+            raise InputError("thresholds", found, "a tensor (N,), falloff in (0, 1)", remedy)
         store, values = cls(len(thresholds), thresholds.device, lr), thresholds.detach().float()
         neutral = torch.sigmoid(torch.full_like(values, NEUTRAL_LOGIT))
         logits = torch.logit(values)

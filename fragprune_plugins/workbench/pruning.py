@@ -16,7 +16,7 @@ from fragprune_plugins.errors import InputError
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.plugins.hooks import engine_for
 from fragprune_plugins.types import RasterInputs, View
-from fragprune_plugins.workbench.scenes.dataset import Shot
+from fragprune_plugins.workbench.scenes.dataset import Shot, shots_of
 
 Keep = float | Literal["auto", "visible"]  # what ``--keep`` leaves: a share, or a rule
 
@@ -124,6 +124,7 @@ def keep_needed(
         shots: the photographs to learn from, on the model's device.
         views: whose pictures must not change; those of the photographs when empty.
     """
+    shots = shots_of("keep_needed", shots)
     views = views or [shot.view for shot in shots]
     return model.keep(kept(model, "auto", shots, views, engine=engine, progress=progress))
 

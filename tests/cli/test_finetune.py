@@ -11,6 +11,7 @@ from cli.commands import run, run_error, run_json, succeeds
 from finetune import tiny
 
 import fragprune_plugins as fp
+from fragprune_plugins.errors import InputError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.learning.pressure import LEAST_PRESSURE
@@ -19,6 +20,7 @@ from fragprune_plugins.workbench.finetune import loop
 from fragprune_plugins.workbench.finetune.finished import advise, describe_untruncated
 from fragprune_plugins.workbench.goals import parse_goal
 from fragprune_plugins.workbench.models.formats.ply import write_ply
+from fragprune_plugins.workbench.scenes import dataset
 
 
 def test_writes_a_pair_and_a_table(data, path, model, tmp_path):
@@ -50,7 +52,7 @@ def test_json_is_one_object_with_the_house_names(words):
 
 def test_says_what_the_model_is_without_its_thresholds(data, words, out):
     report = run_json(*words, 10, "--pressure", 1e-3)
-    profile = run_json("profile", out, "--data", data)
+    profile = run_json("profile", out)  # of the photographs in its record
     for key in ("psnr", "fragments_per_pixel"):
         assert report["untruncated"][key] == profile["columns"]["untruncated"][key]
         assert report["after"][key] == profile["columns"]["truncated"][key]
@@ -152,6 +154,19 @@ def test_what_shows_beside_the_photographs_stays(data, model, words, out):
         assert torch.equal(read_ply(out).xyz, expected.xyz)
     alone = fp.keep_best(model, 0.7, [shot.view for shot in shots])
     assert not torch.equal(alone.xyz, fp.keep_best(model, 0.7, views).xyz)
+
+
+def test_views_to_measure_on_take_no_room_of_those_to_learn_from(words, monkeypatch):
+    kept, held = dataset.Pictures(dataset.ROOM), []
+
+    def learn(left, photographs, *_, **__):
+        held.append(len(set(kept._held) - {shot._pixels for shot in photographs.train}))
+        raise InputError("learning", "begun", "", "")
+
+    monkeypatch.setattr(dataset, "PICTURES", kept)
+    monkeypatch.setattr("fragprune_plugins.workbench.finetune.api.finetune", learn)
+    assert run(*words, 3).exit_code == 1
+    assert held == [0]
 
 
 def test_photographs_that_the_model_does_not_show_are_told_before_the_learning(path, model, words):

@@ -8,7 +8,7 @@ from cli.commands import run_json
 from finetune import tiny
 
 import fragprune_plugins as fp
-from fragprune_plugins.errors import AlignmentError, DivergedError, OutputError
+from fragprune_plugins.errors import AlignmentError, DivergedError, ModelFileError, OutputError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.workbench.models import formats
 from fragprune_plugins.workbench.models.formats.ply import write_ply
@@ -37,6 +37,12 @@ def test_a_pair_is_read_and_replaced_by_one_file(model, tmp_path):
     fp.save(path, read)
     assert [each.name for each in tmp_path.iterdir()] == ["a.ply"]
     assert torch.equal(fp.load(path).falloff, read.falloff)
+
+
+@pytest.mark.parametrize("folder", [".", "..", "/"])
+def test_a_folder_is_named_as_one(folder):
+    with pytest.raises(ModelFileError, match="a folder; expected"):
+        fp.load(folder)
 
 
 def test_the_file_is_the_one_that_the_command_line_writes(tmp_path):

@@ -314,6 +314,7 @@ def test_a_store_holds_the_thresholds_it_was_given():
         torch.tensor([0.5, math.nan]),
         torch.tensor([[0.5]]),
         torch.tensor([1, 2]),
+        [0.5, 0.2],
     ],
 )
 def test_thresholds_that_are_none_are_refused(given):

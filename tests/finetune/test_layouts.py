@@ -170,6 +170,16 @@ def test_photographs_that_exif_turns_in_their_own_shape_are_warned_of(colmap, tu
     assert ("1 of the photographs, such as" in caplog.text) == warned
 
 
+@pytest.mark.parametrize("broken", [b"II*\0\xff\xff\xff\xff", b"MM\0*\0\0\0\x08\xff\xff"])
+def test_a_photograph_with_broken_exif_is_read_and_named(colmap, broken, caplog):
+    path = colmap / "images" / "view03.png"
+    Image.open(path).save(path.with_suffix(".jpg"), exif=b"Exif\0\0" + broken)
+    path.unlink()
+    assert all(shot.image.isfinite().all() for shot in load_dataset(colmap).train)
+    (said,) = caplog.messages
+    assert "view03.jpg, have broken EXIF" in said
+
+
 def test_smaller_images_may_be_rounded_to_a_pixel(colmap):
     """An eighth of 180 rows is 22.5: 2 % of the aspect."""
     (colmap / "sparse" / "0" / "cameras.txt").write_text("7 PINHOLE 320 180 360 360 160 90\n")

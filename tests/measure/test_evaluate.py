@@ -15,6 +15,7 @@ from fragprune_plugins.plugins.hooks import engine_for
 from fragprune_plugins.workbench.figures.evaluate import measure
 from fragprune_plugins.workbench.figures.pictures import save_image, save_panel
 from fragprune_plugins.workbench.scenes.dataset import Dataset
+from fragprune_plugins.workbench.scenes.generated import views_near
 
 NAMES = {
     *("target", "psnr", "ssim", "lpips", "fragments_per_pixel", "evaluated_per_pixel"),
@@ -66,8 +67,11 @@ def test_nothing_to_measure_learn_or_judge_by_is_stated(truth, shots):
 
 def test_what_is_no_data_set_or_settings_is_named(truth, shots):
     for given in ("path", Path("path"), None, shots[0].view, [shots[0].view]):
-        with pytest.raises(InputError, match="expected a data set"):
-            measure(truth, given)
+        for use in (measure, keep_needed):
+            with pytest.raises(InputError, match="expected photographs of a data set"):
+                use(truth, given)
+    with pytest.raises(InputError, match="views_near: a Dataset; expected photographs"):
+        views_near(Dataset(shots, shots))
     with pytest.raises(InputError, match="finetune dataset: 'path'; expected a Dataset"):
         finetune(truth, "path")
     with pytest.raises(InputError, match="finetune settings: 3; expected a Settings"):

@@ -25,7 +25,7 @@ from fragprune_plugins.workbench.figures.extents import covered
 from fragprune_plugins.workbench.figures.metrics import lpips, mean, psnr, ssim
 from fragprune_plugins.workbench.models import model as models
 from fragprune_plugins.workbench.ranks import launched
-from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
+from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot, shots_of
 
 REPEATS = 9
 _COUNTED = ("fragments_per_pixel", "evaluated_per_pixel", "entries_per_pixel")
@@ -108,11 +108,7 @@ def measure(
         EngineError: no such engine here.
         InputError: pictures smaller than 11x11 pixels, or no view.
     """
-    shots = dataset.test if isinstance(dataset, Dataset) else dataset
-    shots = list(shots) if isinstance(shots, Iterable) else [shots]
-    if wrong := [type(each).__name__ for each in shots if not isinstance(each, Shot)]:
-        expected, remedy = "a data set or its photographs", "Pass load_dataset(FOLDER)."
-        raise InputError("measure", f"{wrong[0]} in {type(dataset).__name__}", expected, remedy)
+    shots = shots_of("measure", dataset.test if isinstance(dataset, Dataset) else dataset)
     return measure_all([Candidate(models.of(model))], shots, engine=engine, repeats=repeats)[0]
 
 

@@ -66,7 +66,7 @@ def finetune(**options: Any) -> Report | None:
                 opened.checkpoints.clear()
                 return known
             for shot in opened.dataset.test:  # what cannot be measured shows before the learning
-                expect_window(shot.image)
+                expect_window(shot.unkept().image)
             chosen, lost = _tried(opened)
             over, engine = _learned(chosen, ranks, lost)
             measured = None

@@ -59,6 +59,9 @@ def load(
         SidecarError: the sidecar is broken, another model's, or has another number of rows.
     """
     path = Path(path)
+    if path.is_dir():  # of some, such as ".", no file beside them has a name
+        remedy = "Pass the point_cloud.ply that a 3DGS training saved."
+        raise ModelFileError(str(path), "a folder", "a trained splat's file", remedy)
     if path.with_name(DEFORMATION).exists():
         moved = f"the network beside them ({DEFORMATION}) moves them for each moment"
         found, expected = f"Gaussians that no view shows: {moved}", "a model that one file holds"

@@ -65,7 +65,8 @@ def load_scene_cameras(
     folder: Path, *, white_background: bool = False
 ) -> tuple[list[tuple[str, View]], list[tuple[str, View]]]:
     """Read the named training and held-out views of a scene folder, at their cameras' own sizes."""
-    background, parts = torch.full((3,), float(white_background)), dataset.read_scene(folder)
+    background = torch.full((3,), float(white_background))
+    parts = dataset.read_scene(folder, split=False)
     train, test = ([(row.name, row.camera.view(background)) for row in part] for part in parts)
     return train, test
 

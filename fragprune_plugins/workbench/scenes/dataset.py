@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import weakref
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -16,7 +15,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from fragprune_plugins.errors import DatasetError, printable
+from fragprune_plugins.errors import DatasetError, InputError, log, printable
 from fragprune_plugins.files.reading import MEBIBYTE
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.types import View, one_line
@@ -35,7 +34,14 @@ _LAYOUTS = (
     "(nerfstudio)"
 )
 
-log = logging.getLogger(__name__)
+# what is said of photographs that ``turned`` says this of
+_TURNED = {
+    True: "an EXIF orientation. Their pixels are read as they are stored, as COLMAP and hosts do. "
+    "If the program that found the cameras turned them, turn their pixels, too (exiftran -ai)",
+    None: "broken EXIF, which may say that they are turned. If they are upright, save them "
+    "without it (exiftool -all=)",
+}
+
 SomeShot = TypeVar("SomeShot", bound="Shot")
 
 
@@ -58,6 +64,10 @@ class Shot:
     def looked_at(self, image: Tensor) -> Tensor:
         """A picture of this view (3, H, W), black where the target is not to be looked at."""
         return image
+
+    def unkept(self) -> Shot:
+        """The same for one look, which takes no room of the pictures that are kept."""
+        return self
 
     def to(self: SomeShot, device: torch.device | str) -> SomeShot:
         """The same with its view on a device; ``self`` if it is there already."""
@@ -126,6 +136,10 @@ class Photograph(Shot):
         if centred:
             seen = replace(seen, cx=seen.width / 2, cy=seen.height / 2)
         return replace(same, view=seen.view(behind.cpu())).to(behind.device)
+
+    def unkept(self) -> Photograph:
+        """The same, whose pixels go with it."""
+        return replace(self, _pixels=PixelSlot())
 
     @property
     def transparent(self) -> bool:
@@ -239,6 +253,16 @@ class Dataset:
         return Dataset([s.to(device) for s in self.train], [s.to(device) for s in self.test])
 
 
+def shots_of(where: str, given: Any) -> list[Shot]:
+    """A list of the photographs that a function was given; InputError if that is something else."""
+    shots = list(given) if isinstance(given, Iterable) else [given]
+    if wrong := [type(each).__name__ for each in shots if not isinstance(each, Shot)]:
+        found = f"a {wrong[0]}" + (f" in a {type(given).__name__}" if given is not shots[0] else "")
+        remedy = "Pass those of load_dataset(FOLDER): its .train or .test."
+        raise InputError(where, found, "photographs of a data set", remedy)
+    return shots
+
+
 def load_photographs(photographs: Photographs) -> Dataset:
     """Load the photographs of a run with ``load_dataset``; if it holds none out, all train."""
     read = dict(vars(photographs))
@@ -296,13 +320,7 @@ def load_dataset(
             "output folder, with cfg_args, or finetune made them",
             *(printable(str(folder)), off),
         )
-    if lying := [row.image for part in rows for row in part if turned(row.image)]:
-        log.warning(
-            "%d of the photographs, such as %s, have an EXIF orientation. Their pixels are read as "
-            "they are stored, as COLMAP and hosts read them. If the program that found the cameras "
-            "turned them, turn their pixels, too (exiftran -ai)",
-            *(len(lying), printable(str(lying[0]))),
-        )
+    _warn_of_turned(row.image for part in rows for row in part)
     if dataset.leaked:
         log.warning(
             "%s: %d of the %d held-out views are training views too, so figures on them flatter: "
@@ -312,11 +330,21 @@ def load_dataset(
     return dataset
 
 
-def read_scene(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]]:
+def _warn_of_turned(images: Iterable[Path]) -> None:
+    answers = {image: turned(image) for image in images}
+    for answer, said in _TURNED.items():
+        if such := [image for image, each in answers.items() if each is answer]:
+            some = "%d of the photographs, such as %s, have "
+            log.warning(some + said, len(such), printable(str(such[0])))
+
+
+def read_scene(
+    folder: Path, images: str = "images", *, split: bool = True
+) -> tuple[list[Posed], list[Posed]]:
     """Read the training and the held-out cameras of a scene, and where their images should be.
 
     No image is opened, but for the size of one whose transforms file has no ``w`` and ``h``.
-    DatasetError as of ``load_dataset``.
+    DatasetError as of ``load_dataset``; without ``split``, a single camera is enough.
     """
     if not os.path.isdir(folder):  # False for a name that no folder can have, too
         found, remedy = "no such folder", "Check --data."
@@ -331,13 +359,11 @@ def read_scene(folder: Path, images: str = "images") -> tuple[list[Posed], list[
     if model is None and not known:
         raise DatasetError(str(folder), "neither layout", _LAYOUTS, _where_else(folder))
     train, test = (transforms if known else colmap).read(folder, _image_folder(folder, images))
-    for name, part in (("training", train), ("held-out", test)):
-        if not part:
-            found = f"no {name} view ({len(train) + len(test)} in all)"
-            expected = "at least one training and one held-out view"
-            held = "every 8th is held out, unless the scene lists others by name"
-            remedy = f"Add photographs; {held}."
-            raise DatasetError(str(folder), found, expected, remedy)
+    if not (train and test if split else train or test):
+        found = f"no {'held-out' if train else 'training'} view ({len(train) + len(test)} in all)"
+        expected = "at least one training and one held-out view" if split else "at least one view"
+        held = "every 8th is held out, unless the scene lists others by name"
+        raise DatasetError(str(folder), found, expected, f"Add photographs; {held}.")
     return train, test
 
 

@@ -132,7 +132,7 @@ def views_near(shots: Sequence[dataset.Shot], *, seed: int = 0) -> list[View]:
 
     There are none beside them if no two photographs look the same way.
     """
-    named = [(shot.name, shot.view) for shot in shots]
+    named = [(shot.name, shot.view) for shot in dataset.shots_of("views_near", shots)]
     return [view for _, view in (*named, *beside(named, _ASIDE * len(named), seed=seed))]
 
 

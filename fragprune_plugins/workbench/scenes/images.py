@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from fragprune_plugins.constants import SIDE_MAX
 from fragprune_plugins.errors import DatasetError
@@ -59,7 +59,13 @@ def opened(path: Path) -> Iterator[Image.Image]:
     """
     with IMAGE_FILE.reading(path) as reading, warnings.catch_warnings():
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # PIXELS_MAX decides
-        with Image.open(reading.file, formats=_FORMATS) as image:
+        warnings.filterwarnings("ignore", "Corrupt EXIF")  # pixels are read without
+        try:
+            image = Image.open(reading.file, formats=_FORMATS)
+        except UnidentifiedImageError as error:
+            kinds = f"no {', '.join(_FORMATS)}" if reading.size else "it is empty"
+            raise ValueError(kinds) from error
+        with image:
             width, height = image.size
             if width * height > PIXELS_MAX or max(width, height) > SIDE_MAX:
                 expected = f"at most {PIXELS_MAX:,} pixels, and {SIDE_MAX:,} a side"
@@ -78,10 +84,19 @@ def image_size(path: Path) -> tuple[int, int]:
         return image.size
 
 
-def turned(path: Path) -> bool:
-    """Whether EXIF turns an image without another aspect, which would show in its camera."""
+def turned(path: Path) -> bool | None:
+    """Whether EXIF turns an image without another aspect, which would show in its camera.
+
+    None if it is broken, so that it does not tell.
+    """
     with contextlib.suppress(DatasetError), opened(path) as image:
         if "exif" in image.info:  # elsewhere Pillow decodes the image to look for it
-            turn = image.getexif().get(_ORIENTATION, 1)
+            exif = Image.Exif()
+            try:
+                warnings.simplefilter("error")
+                exif.load(image.info["exif"])
+            except (Warning, SyntaxError):
+                return None
+            turn = exif.get(_ORIENTATION, 1)
             return turn in (2, 3, 4) or (turn in (5, 6, 7, 8) and image.width == image.height)
     return False
