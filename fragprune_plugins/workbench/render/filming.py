@@ -26,9 +26,12 @@ _COLOURS = [
     "-vf",
     "scale=out_color_matrix=bt709:out_range=tv,"
     "setparams=range=tv:colorspace=bt709:color_primaries=bt709:color_trc=iec61966-2-1",
+    *("-color_range", "tv", "-colorspace", "bt709"),
+    *("-color_primaries", "bt709", "-color_trc", "iec61966-2-1"),
 ]
 """Of ffmpeg. By itself it writes those of BT.601, and does not say so; players take films of 720
-rows for BT.709, and show greens and reds 20 levels of 255 off."""
+rows for BT.709, and show greens and reds 20 levels of 255 off. They are said twice: ffmpeg 4 does
+not hear the filter, and 9 not all of the options."""
 
 _PICTURE: dict[str, Any] = {"width": 1280, "height": 720, "fov_y": 50.0}
 
