@@ -85,6 +85,7 @@ def after_run(folder, scene, stage, does, ends):
     except FragpruneError as error:
         said = type(error)
     assert said is ends
+    gc.collect()  # in Python 3.13 a frame of contextlib holds the exception that holds the frame
     stay = [
         module
         for module, each in sys.modules.items()
