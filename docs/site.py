@@ -8,6 +8,7 @@ index.md, which lists every page.
 from __future__ import annotations
 
 import base64
+import logging
 import posixpath
 import re
 import tempfile
@@ -21,6 +22,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
+log = logging.getLogger("mkdocs.hooks.site")
 DOCS = Path(__file__).parent
 OUTSIDE = {
     "CHANGELOG.md": "changelog.md",
@@ -69,6 +71,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         files.append(File.generated(config, page, content=text))
     for name, make in generated().items():
         files.append(File.generated(config, f"reference/{name}", content=make()))
+    log.info("Running the tutorial, which trains: about a minute")
     text, pictures = run((DOCS / "tutorial.ipynb").read_text("utf-8"))
     files.append(File.generated(config, "tutorial.md", content=text))
     for name, picture in pictures.items():
