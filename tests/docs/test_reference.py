@@ -5,7 +5,7 @@ from pathlib import Path
 from runpy import run_path
 
 import pytest
-from cli.commands import run_json
+from cli.commands import run_json, succeeds
 
 import fragprune_plugins
 from fragprune_plugins import errors
@@ -68,3 +68,9 @@ def test_every_adapter_says_what_it_is_for(adapter):
     (told,) = (a for a in run_json("adapters")["adapters"] if a["name"] == adapter.name)
     assert told["limits"] == [*adapter.info.limits]
     assert adapter.name != "vanilla-3dgs" or told["scripts"] == ["train.py"]
+
+
+def test_the_list_has_one_column_for_names():
+    lines = succeeds("adapters").stdout.splitlines()
+    starts = {line.index(f"{a.info.title}, ") for a, line in zip(ADAPTERS, lines, strict=True)}
+    assert len(starts) == 1

@@ -91,11 +91,18 @@ def test_a_gpu_is_checked_each_time_and_what_failed_told_from_what_could_not_run
     assert f"{line}{verdict}\n" in text
 
 
-def test_what_is_missing_is_a_sentence_with_what_to_do(monkeypatch):
-    monkeypatch.setattr(torch.version, "cuda", None)
+@pytest.mark.parametrize(
+    ("cuda", "remedy"),
+    [
+        (None, "Install torch for CUDA."),
+        ("13.0", "Install fragprune-plugins[cuda13], for torch is for CUDA 13.0."),
+    ],
+)
+def test_what_is_missing_is_a_sentence_with_what_to_do(monkeypatch, cuda, remedy):
+    monkeypatch.setattr(torch.version, "cuda", cuda)
     monkeypatch.setenv(kernels.ENVIRONMENT, "off")
     lines = CliRunner().invoke(cli, ["doctor"]).output.splitlines()
     (line,) = [each for each in lines if each.startswith("cuda engine: ")]
     assert "switched off" in line
-    assert line.endswith("For an NVIDIA GPU: Install torch for CUDA.")
+    assert line.endswith(f"For an NVIDIA GPU: {remedy}")
     assert not [each for each in lines if "None" in each or "True" in each or "False" in each]

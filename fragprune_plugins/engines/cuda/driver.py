@@ -36,7 +36,7 @@ def remedy() -> str:
         return "Install torch for CUDA."
     old = cuda.startswith("11.")  # brings no NVRTC that we can use
     extra = "[cuda12] and nvidia-cuda-nvrtc-cu12" if old else f"[cuda{cuda.split('.')[0]}]"
-    return f"Install fragprune-plugins{extra}, for torch is for CUDA {cuda}; see fragprune doctor."
+    return f"Install fragprune-plugins{extra}, for torch is for CUDA {cuda}."
 
 
 def version() -> str:

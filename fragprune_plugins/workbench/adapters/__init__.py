@@ -36,8 +36,10 @@ def command() -> Report:
         }
         for adapter in plugins.adapters
     ]
+    width = max((len(adapter.name) for adapter in plugins.adapters), default=0)
     lines = [
-        "{name:<16} {title}, github {repo}: {states}".format(**adapter) for adapter in adapters
+        f"{{name:<{width}}}  {{title}}, github {{repo}}: {{states}}".format(**adapter)
+        for adapter in adapters
     ] or ["No adapter is installed."]
     lines += [str(finding) for finding in plugins.findings]
     data = {"adapters": adapters, "findings": [f.as_dict() for f in plugins.findings]}
