@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli.commands import run_json, succeeds
+from cli.commands import fails, run_json, succeeds
 from finetune import tiny
 from PIL import Image
 
@@ -96,15 +96,43 @@ def test_without_a_folder_there_is_the_table_alone(model, tmp_path, monkeypatch)
     assert not list(Path().iterdir())
 
 
-def test_the_cameras_of_its_training_are_taken_unless_others_are_asked_for(tmp_path):
-    run = tiny.host_output(tmp_path / "run", tmp_path / "scene", tiny.random_model())
+@pytest.mark.parametrize("write", [tiny.write_colmap, tiny.write_blender])
+def test_a_scene_of_one_camera_serves_where_nothing_is_learned(model, tmp_path, write):
+    data = write(tmp_path / "data", tiny.photographs(tiny.random_model()))
+    if write is tiny.write_colmap:
+        images = data / "sparse/0/images.txt"
+        images.write_text("\n".join(images.read_text().splitlines()[-2:]) + "\n\n")
+    else:
+        for part, frames in (("train", 1), ("test", 0)):
+            listed = json.loads((file := data / f"transforms_{part}.json").read_text())
+            file.write_text(json.dumps(listed | {"frames": listed["frames"][:frames]}))
+    report = run_json("audit", model, "--data", data)
+    assert "1 of the 1 cameras" in report["cameras"]["why"]
+    words = (model, "--self", "--data", data)
+    assert run_json("profile", *words)["views"] == 1
+    out = ("--iters", 1, "--out", tmp_path / "learned.ply")
+    fails("finetune", *words, *out, says="no training view", code=1)
+    if write is tiny.write_colmap:
+        images.write_text("")
+        fails("audit", model, "--data", data, says="at least one view", code=1)
+
+
+@pytest.mark.parametrize(("divided", "width"), [(1, 1100), (4, 825)])
+def test_the_cameras_of_its_training_are_taken_unless_others_are_asked_for(
+    tmp_path, divided, width
+):
+    """At the size that they had there, but not too large."""
+    given = {"resolution": divided}
+    run = tiny.host_output(tmp_path / "run", tmp_path / "scene", tiny.random_model(), **given)
     camera, *_ = json.loads((run / "cameras.json").read_text())
     camera |= {"width": 3300, "height": 33, "fx": 3000.0, "fy": 3000.0}
     (run / "cameras.json").write_text(json.dumps([camera]))
     out = ("--out", tmp_path / "out")
     report = run_json("audit", run, *out)
     assert report["cameras"]["kind"] == "given"
-    assert report["maps"]["views"][0]["width"] == 1100  # of 3300: thrice less, not to be too large
+    assert report["maps"]["views"][0]["width"] == width  # of 3300
+    asked = run_json("audit", run, "--resolution", 2, *out)
+    assert asked["maps"]["views"][0]["width"] == 1650
     for side in ("orbit", "inside"):
         asked = run_json("audit", run, f"--{side}", "--views", 1, "--resolution", 16, *out)
         assert asked["cameras"]["kind"] == side

@@ -86,7 +86,7 @@ def test_a_folder_with_one_output_folder_is_that(output, tmp_path):
 def test_options_override_the_training(output, path):
     assert run_json("profile", output, "--resolution", 2)["views"] == 2
     fails("profile", output, "--images", "images_2", says="images_2", code=1)
-    fails("profile", path, says="no cfg_args")  # a model elsewhere needs --data
+    fails("profile", path, says="or cfg_args of a training")  # a model elsewhere needs --data
 
 
 def test_pictures_are_drawn_as_the_training_did_around_the_middle(output, data, lens, tmp_path):
@@ -105,7 +105,10 @@ def test_pictures_are_drawn_as_the_training_did_around_the_middle(output, data, 
         for centre in psnr:
             lens(centre)
             psnr[centre] = run_json("profile", pruned, "--data", data)["psnr"]
+        assert run_json("profile", pruned)["psnr"] == psnr["16 16"]  # by the record beside it
         assert psnr["20 16"] == psnr["16 16"]
+    again = run("finetune", pruned, "--out", tmp_path / "again.ply", "--iters", 1).stderr
+    assert f"Photographs: {data}, which" in again
 
 
 @pytest.mark.parametrize("middle", [True, False])
@@ -309,6 +312,9 @@ def test_a_training_without_a_record_is_compared_as_the_other_one_was_drawn(
     assert changes[0] == 0 != changes[1] == changes[2]
     (warned,) = [each.message for each in caplog.records if "no record" in each.message]
     assert f"{newest_model(output)} has no record" in warned
+    (tmp_path / "gsplat/ply").mkdir(parents=True)
+    plain = shutil.copy(mine, tmp_path / "gsplat/ply/point_cloud_29999.ply")
+    assert run_json("compare", plain, other)["psnr_change"] == 0
 
 
 def test_a_record_that_says_nothing_of_its_result_is_believed_by_its_time_alone(tmp_path):

@@ -29,7 +29,8 @@ from fragprune_plugins.workbench.commands.command import Command, Report, work_o
 @click.option(
     "--resolution",
     type=click.IntRange(1, 16),
-    help="Divide the pictures' sides by this; default: until they have 1,600 pixels or less.",
+    help="Divide the sides of pictures by this; default: as in the training of MODEL, and until "
+    "they have 1,600 pixels or less.",
 )
 @click.option("--white-background", is_flag=True, help="Draw over white, with given cameras.")
 @shared.truncation_option

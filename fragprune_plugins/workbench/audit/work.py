@@ -40,15 +40,17 @@ def audit(
     opening.warn_if_antialiased(model)
     if out is not None:
         writable_folder(out)
-    if cameras is None and data is None and orbit is None:
-        cameras = cameras_of(model)
+    given, size = frozenset({"resolution"} if resolution else ()), Resolution(resolution or 1)
+    scene = options.SceneOptions(
+        data, resolution=size, white_background=white_background, given=given
+    )
+    if cameras is None and data is None and orbit is None and (cameras := cameras_of(model)):
+        scene = opening.at_its_size(model, scene)
     if cameras is None and data is None:
         side: placing.Side = "auto" if orbit is None else "orbit" if orbit else "inside"
         placed = placing.place(loaded, views, rasterizer, side=side, divide=resolution or 1)
     else:
-        scene = options.SceneOptions(data, white_background=white_background)
-        scene = opening.over_its_background(model, scene)
-        placed = _given(cameras, scene, views, resolution)
+        placed = _given(cameras, opening.over_its_background(model, scene), views)
     named = [(name, view.to(device)) for name, view in placed.views]
     measurements, shown = measured(loaded, named, engine=rasterizer, progress=True)
     figures: dict[str, Any] = {
@@ -71,9 +73,7 @@ def audit(
     return command.Report(figures | {"page": out and str(out / PAGE)}, "\n".join(lines))
 
 
-def _given(
-    cameras: Path | None, scene: options.SceneOptions, count: int, divide: int | None
-) -> placing.Placed:
+def _given(cameras: Path | None, scene: options.SceneOptions, count: int) -> placing.Placed:
     """Cameras of a file or a scene folder, ``count`` at most, evenly spread."""
     if cameras is not None:
         named = load_cameras(cameras, white_background=scene.white_background)
@@ -81,7 +81,9 @@ def _given(
         assert scene.data is not None
         train, test = load_scene_cameras(scene.data, white_background=scene.white_background)
         named = sorted([*train, *test], key=lambda each: each[0])
-    chosen = list(evenly_spaced(named, count))
-    longest = max(max(view.width, view.height) for _, view in chosen)
+    chosen = sized(list(evenly_spaced(named, count)), scene.resolution)
+    if "resolution" not in scene.given:
+        longest = max(max(view.width, view.height) for _, view in chosen)
+        chosen = sized(chosen, Resolution(-(-longest // LARGEST)))
     why = f"{len(chosen)} of the {len(named)} cameras of {cameras or scene.data}, evenly spread."
-    return placing.Placed(sized(chosen, Resolution(divide or -(-longest // LARGEST))), "given", why)
+    return placing.Placed(chosen, "given", why)

@@ -44,13 +44,14 @@ def photographs_for(
 ) -> Photographs:
     """The photographs that the options name; without --data those that the model was trained on.
 
-    Options that were given override what the training says. Without either it is a UsageError.
+    Options that were given override what the training says. Without either it is a UsageError,
+    and what cannot be read of its arguments or its record is a DatasetError or a RecordError.
     """
     if scene.data is not None:
         return drawn_as_trained(scene, model)
-    trained = output.trained_on(model)
+    trained = output.trained_on(model) or _recorded(model)
     if trained is None:
-        found = f"no folder, and no {output.ARGUMENTS} of a training around {model}"
+        found = f"no folder, and no record beside {model} or {output.ARGUMENTS} of a training"
         raise UsageError("--data", found, "photographs", remedy)
     said = f"Photographs: {trained.folder}, which the model was trained on"
     click.echo(printable(said), err=True)

@@ -150,7 +150,7 @@ CAMERAS_HELP = (
 )
 
 CAMERAS_APART = Alone(("--cameras", "--data", "--orbit", "--inside"), "one source of cameras")
-TRAINED_ON = "Default: the photographs that MODEL was trained on, by the cfg_args of its host."
+TRAINED_ON = "Default: those that MODEL was trained on, by its record or the cfg_args of its host."
 
 
 @dataclass(frozen=True)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from fragprune_plugins.errors import UsageError, printable
+from fragprune_plugins.errors import UsageError, log, printable
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.types import View
 from fragprune_plugins.workbench.commands import command, opening, options
@@ -15,8 +14,6 @@ from fragprune_plugins.workbench.figures import evaluate, matching, records, wor
 from fragprune_plugins.workbench.figures.pictures import leave_panels
 from fragprune_plugins.workbench.models.model import load, writable_folder
 from fragprune_plugins.workbench.scenes import output, training
-
-log = logging.getLogger(__name__)
 
 
 def compare(

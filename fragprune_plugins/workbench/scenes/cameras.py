@@ -18,7 +18,7 @@ from fragprune_plugins.errors import DatasetError
 from fragprune_plugins.files.reading import UntrustedFile
 from fragprune_plugins.hosts.photographs import Resolution
 from fragprune_plugins.types import View
-from fragprune_plugins.workbench.scenes import dataset, pinhole, transforms
+from fragprune_plugins.workbench.scenes import dataset, pinhole, posed, transforms
 from fragprune_plugins.workbench.scenes.transforms import matrix
 
 _CAMERAS = UntrustedFile(
@@ -67,6 +67,10 @@ def load_scene_cameras(
     """Read the named training and held-out views of a scene folder, at their cameras' own sizes."""
     background = torch.full((3,), float(white_background))
     parts = dataset.read_scene(folder, split=False)
+    if not all(parts):
+        parts = posed.hold_out(
+            [*parts[0], *parts[1]]
+        )  # of a single one there is none to learn from
     train, test = ([(row.name, row.camera.view(background)) for row in part] for part in parts)
     return train, test
 

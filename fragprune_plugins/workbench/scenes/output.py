@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import ast
 import contextlib
-import logging
 import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from fragprune_plugins.errors import DatasetError, ModelFileError, printable
+from fragprune_plugins.errors import DatasetError, ModelFileError, log, printable
 from fragprune_plugins.files.reading import MEBIBYTE, UntrustedFile
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.hosts.source import parsed
@@ -33,8 +32,6 @@ _FILE = UntrustedFile(
     limit=MEBIBYTE,
 )
 
-log = logging.getLogger(__name__)
-
 
 def newest_model(folder: Path) -> Path:
     """The PLY of the highest iteration in an output folder, or in the only one of a folder's."""
@@ -51,10 +48,9 @@ def newest_model(folder: Path) -> Path:
 
 
 def output_folder(model: Path) -> Path | None:
-    """The output folder that a host wrote a model into; None if it lies elsewhere."""
-    folders = model.resolve().parents
-    inside = len(folders) > 2 and folders[1].name == "point_cloud"
-    return folders[2] if inside and folders[0].name.startswith("iteration_") else None
+    """The output folder that a host, or gsplat, wrote a model into; None if it lies elsewhere."""
+    place, hosts = model.resolve(), {"point_cloud/iteration_*/*": 2, "ply/point_cloud_*.ply": 1}
+    return next((place.parents[up] for file, up in hosts.items() if place.match(file)), None)
 
 
 def cameras_of(model: Path) -> Path | None:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 from collections import Counter
 from pathlib import Path
 
 import torch
 
-from fragprune_plugins.errors import DatasetError, printable
+from fragprune_plugins.errors import DatasetError, log, printable
 from fragprune_plugins.files.reading import UntrustedFile
 from fragprune_plugins.types import View
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
@@ -17,7 +16,6 @@ from fragprune_plugins.workbench.scenes.dataset import Dataset
 from fragprune_plugins.workbench.scenes.output import arguments, cameras_of, output_folder
 from fragprune_plugins.workbench.scenes.transforms import matrix
 
-log = logging.getLogger(__name__)
 _FAR = 0.01  # of the cameras' extent, or radians: other worlds are further, files round less
 _NEUTRAL = 1e-3  # of exposures: a change that no 8-bit level shows
 
