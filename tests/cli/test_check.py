@@ -67,10 +67,10 @@ def test_the_host_that_fits_with_every_seam_in_its_place(host):
     [
         ("prune(threshold, 0.005", "clone(grads", "densify_and_clone, which changes the model"),
         ("restore(model_params, opt)", "load_ply(checkpoint)", "train.py has no restore"),
-        ("optimizer.step()", "optimizer.step(); gaussians._xyz = merged", "changes _xyz outside"),
+        ("optimizer.step()", "optimizer.step(); gaussians._xyz = loss", "changes _xyz outside"),
         ("= GaussianModel(", "= OtherModel(", "train.py makes OtherModel"),
         ("loss.backward()", "loss.backward(", "train.py is no valid Python"),
-        ("loss.backward()", "loss.backward(); more.backward()", "2 places that go back"),
+        ("loss.backward()", "loss.backward(); loss.backward()", "2 places that go back"),
     ],
 )
 def test_a_script_with_other_steps_is_not_vanillas(host, old, new, found):

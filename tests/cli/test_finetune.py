@@ -160,7 +160,7 @@ def test_views_to_measure_on_take_no_room_of_those_to_learn_from(words, monkeypa
     kept, held = dataset.Pictures(dataset.ROOM), []
 
     def learn(left, photographs, *_, **__):
-        held.append(len(set(kept._held) - {shot._pixels for shot in photographs.train}))
+        held.append(len(set(kept) - {shot._pixels for shot in photographs.train}))
         raise InputError("learning", "begun", "", "")
 
     monkeypatch.setattr(dataset, "PICTURES", kept)
