@@ -1,10 +1,11 @@
 """Portable: no thresholds, less area, and a file that every viewer draws as it is."""
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 import torch
-from cli.commands import run_json, succeeds
+from cli.commands import fails, run_json, succeeds
 from finetune import tiny
 
 import fragprune_plugins as fp
@@ -14,6 +15,7 @@ from fragprune_plugins.engines import create_engine
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.learning.pressure import OWN_AREA_PRESSURE, PORTABLE_ELASTICITY
 from fragprune_plugins.workbench.figures.evaluate import covered_per_pixel
+from fragprune_plugins.workbench.finetune import trial
 
 
 @pytest.fixture
@@ -97,3 +99,11 @@ def test_a_model_with_thresholds_is_refused(scene):
     model = tiny.cut(model, 0.1)
     with pytest.raises(UsageError, match="--no-truncation"):
         finetune(model, fp.load_dataset(data), Settings(goal=Portable()))
+
+
+def test_the_command_refuses_one_before_it_tries_anything(scene, tmp_path, monkeypatch):
+    data, _, model = scene
+    fp.save(pruned := tmp_path / "pruned.ply", tiny.cut(model, 0.1))
+    monkeypatch.setattr(trial, "forgotten", Mock(side_effect=AssertionError("tried")))
+    words = ("finetune", pruned, "--data", data, "--out", tmp_path / "out.ply", "--portable")
+    fails(*words, says="--no-truncation", code=2)

@@ -82,7 +82,7 @@ def finetune(
     _expect_kinds(dataset, settings)
     if isinstance(dataset.train[0], OwnPicture):
         settings = replace(settings, itself=True)
-    _expect_fit(model, settings, moves=relocate is not None, sharded=sharded)
+    expect_fit(model, settings, moves=relocate is not None, sharded=sharded)
     dataset = dataset.to(device)
     if isinstance(settings.goal, AtMost):
         train = partial(finetune, model, dataset, engine=engine, progress=progress, ranks=ranks)
@@ -106,7 +106,9 @@ def _expect_kinds(dataset: Dataset, settings: Settings) -> None:
         raise InputError("dataset", "no training view", "at least one", "Pass photographs.")
 
 
-def _expect_fit(model: Model, settings: Settings, *, moves: bool, sharded: bool) -> None:
+def expect_fit(
+    model: Model, settings: Settings, *, moves: bool = False, sharded: bool = False
+) -> None:
     """Raise UsageError unless the model can become what is asked for."""
     if settings.goal.on_area and model.pruned:
         raise UsageError(

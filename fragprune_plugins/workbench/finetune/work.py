@@ -100,6 +100,7 @@ def _open(asked: Asked) -> Opened:
     truncation = settings.goal.presses and not asked.no_truncation
     where = "cpu" if asked.shard else device
     whole = models.load(asked.model, truncation=truncation, device=where)
+    api.expect_fit(whole, settings)
     warn_if_antialiased(asked.model)
     if asked.itself:
         own = own_cameras_for(asked.model, scene, asked.cameras, asked.seed)
