@@ -15,8 +15,7 @@ from fragprune_plugins.workbench.commands.options import FILE, engine_options
     "--out",
     type=FILE,
     default="fragprune-demo",
-    help="Folder for the scene, the models, the pictures and index.html: a new folder, or the "
-    "folder of an earlier demo, which is emptied.",
+    help="Folder for the scene, the models, the pictures and index.html: a new or empty one.",
 )
 @click.option(
     "--iters",

@@ -51,22 +51,16 @@ class Drawn:
         return [f"{view.name}_{kind}.png" for view in self.views for kind in ("photograph", *kinds)]
 
 
-def compose(
-    template: Path,
-    drawn: Drawn | None,
-    source: Callable[[str], str],
-    *,
-    labels: Sequence[str] = NAMES,
-    **values: Any,
-) -> str:
-    """A page of a result as HTML, by ``TEMPLATE`` or one that extends it, which gets the values.
+def save(
+    target: Path, drawn: Drawn | None, template: Path, source: Callable[[str], str], **values: Any
+) -> None:
+    """Write a page of results by ``TEMPLATE`` or one that extends it, which gets the values.
 
-    ``source`` turns a picture's file name into its ``src``, a relative path or a data URL. Of
-    ``values``, facts are (number, words) each, plots (heading, file), and others have a heading, a
-    sentence and a table.
+    ``source`` turns a picture's file name into its ``src``, a relative path or a data URL.
     """
-    values |= vars(drawn or Drawn()) | {"source": source, "names": NAMES, "labels": labels}
-    return page.render(template, TEMPLATE.parent, **values)
+    values |= vars(drawn or Drawn()) | {"source": source, "names": NAMES}
+    with replacing(target) as path:
+        path.write_text(page.render(template, TEMPLATE.parent, **values), encoding="utf-8")
 
 
 def draw_views(
@@ -75,7 +69,7 @@ def draw_views(
     pruned: evaluate.Candidate,
     shots: Sequence[Shot],
     engine: Engine,
-    enlarge: int = 1,
+    enlarge: int,
 ) -> Drawn:
     """Draw some evenly spread views into a folder: photograph, both models, and maps of both.
 

@@ -14,7 +14,6 @@ import torch
 
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import DatasetError, ModelFileError, RecordError, SidecarError
-from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.files.reading import MEBIBYTE, UntrustedFile, lies_in
 from fragprune_plugins.workbench.commands.command import Report
@@ -43,6 +42,35 @@ _ONLY_CONTROLS = (
 
 def report(*, folder: Path, out: Path | None, data: Path | None, engine: EngineOptions) -> Report:
     """Do what ``fragprune report`` promises; its options are the arguments."""
+    target = out or folder / PAGE
+    with TemporaryDirectory() as name:
+        pictures = Path(name)
+        values, drawn, summary = results(folder, pictures, data, engine)
+        how = report_page.TEMPLATE, lambda each: embedded(pictures / each)
+        report_page.save(target, drawn, *how, **values)
+    lines = [summary["result"], *summary["notes"], f"Wrote {target}."]
+    return Report({"page": str(target)} | summary, "\n".join(lines))
+
+
+def results(
+    folder: Path,
+    pictures: Path,
+    data: Path | None,
+    engine: EngineOptions,
+    *,
+    enlarge: int = 1,
+    first: str = "",
+) -> tuple[dict[str, Any], Drawn | None, dict[str, Any]]:
+    """What a page says of the results in a folder, with its pictures in another.
+
+    Args:
+        data: the scene that the user named.
+        enlarge: how many times as wide and high as the photographs models are drawn.
+        first: the name of the view to begin with.
+
+    Returns:
+        Values for the page's template, the views, and what ``--json`` says.
+    """
     every = records.find(folder)
     for record in every:
         _check(record)
@@ -53,46 +81,41 @@ def report(*, folder: Path, out: Path | None, data: Path | None, engine: EngineO
     files = [record.path for record in every]
     line = _sentence(main, files)
     facts, begun = _measured(main, files)
-    with TemporaryDirectory() as name:
-        pictures = Path(name)
-        drawn, learning, missing = _draw(main, folder, pictures, data, partial(open_engine, engine))
-        more = [*learning, *_files(every, folder, pictures)]
-        notes = [*begun, *map(_outdated, every), _ONLY_CONTROLS if control else "", missing]
-        notes = [note for note in notes if note]
-        text = report_page.compose(
-            report_page.TEMPLATE,
-            drawn,
-            lambda file: embedded(pictures / file),
-            title=f"{_heading(main)} of {_of(main, folder)}",
-            facts=facts,
-            quote=line,
-            seen=bool(main.data.get("seen")),
-            labels=("original", "control") if control else report_page.NAMES,
-            notes=records.portable(notes, folder),
-            table=_table(main),
-            plots=more,
-            others=[
-                {"heading": _heading(one), "sentence": _sentence(one, files), "table": _table(one)}
-                for one in every
-                if one is not main
-            ],
-            settings=Table(["", ""], _settings(main), words=2),
-        )
-    target = out or folder / PAGE
-    with replacing(target) as path:
-        path.write_text(text, encoding="utf-8")
-    summary = {
-        "page": str(target),
-        "result": line,
-        "command": main.command,
-        "control": control,
-        "record": str(main.path),
-        "views": [view.name for view in drawn.views] if drawn else [],
-        "pictures": (len(drawn.files) if drawn else 0) + len(more),
-        **{key: main.data.get(key) for key in ("before", "after", "adapter", "iterations")},
-        "notes": notes,
+    how = partial(open_engine, engine), enlarge, first
+    drawn, learning, missing = _draw(main, folder, pictures, data, *how)
+    more = [*learning, *_files(every, folder, pictures)]
+    notes = [*begun, *map(_outdated, every), _ONLY_CONTROLS if control else "", missing]
+    notes = [note for note in notes if note]
+    values = {
+        "title": f"{_heading(main)} of {_of(main, folder)}",
+        "facts": facts,
+        "quote": line,
+        "seen": bool(main.data.get("seen")),
+        "labels": ("original", "control") if control else report_page.NAMES,
+        "notes": records.portable(notes, folder),
+        "table": _table(main),
+        "plots": more,
+        "others": [
+            {"heading": _heading(one), "sentence": _sentence(one, files), "table": _table(one)}
+            for one in every
+            if one is not main
+        ],
+        "settings": Table(["", ""], _settings(main), words=2),
     }
-    return Report(summary, "\n".join([line, *notes, f"Wrote {target}."]))
+    return (
+        values,
+        drawn,
+        {
+            "result": line,
+            "command": main.command,
+            "control": control,
+            "record": str(main.path),
+            "views": [view.name for view in drawn.views] if drawn else [],
+            "pictures": (len(drawn.files) if drawn else 0) + len(more),
+            **{key: main.data.get(key) for key in ("before", "after", "adapter", "iterations")},
+            "notes": notes,
+        },
+    )
 
 
 def _check(record: Record) -> None:
@@ -230,6 +253,8 @@ def _draw(
     folder: Path,
     data: Path | None,
     opened: Callable[[], tuple[Engine, torch.device]],
+    enlarge: int,
+    first: str,
 ) -> tuple[Drawn | None, list[tuple[str, str]], str]:
     """Draw held-out views and learning curves into a folder; with an engine only if there are any.
 
@@ -264,7 +289,8 @@ def _draw(
     if _outdated(record):
         return None, learning, f"No views are shown: {source.models[-1].name} was changed since."
     before, after = (Candidate(each, source.drawing) for each in loaded)
-    return report_page.draw_views(folder, before, after, dataset.test, engine), learning, ""
+    shots = sorted(dataset.test, key=lambda shot: shot.name != first)
+    return report_page.draw_views(folder, before, after, shots, engine, enlarge), learning, ""
 
 
 def _outdated(record: Record) -> str:
