@@ -216,29 +216,33 @@ def on(
 
 
 def drawn_and_learned(
-    engine: Engine, inputs: RasterInputs, thresholds: Tensor
+    engine: Engine, inputs: RasterInputs, thresholds: Tensor | None
 ) -> dict[str, Tensor]:
-    """The picture (3, H, W), and gradients of every trained tensor by name; on the CPU."""
-    given = {name: getattr(inputs.splats, name) for name in _LEARNED}
-    given |= {"thresholds": thresholds, "background": inputs.view.background}
-    given["hook"] = given["means"].new_zeros(len(thresholds), 3)
-    like = given["means"]
+    """The picture (3, H, W), and gradients of every tensor that gets one, by name; on the CPU.
+
+    Without thresholds they are of the picture alone.
+    """
+    like = inputs.splats.opacities
+    given = {name: getattr(inputs.splats, name) for name in LEARNED}
+    given |= {"background": inputs.view.background, "hook": like.new_zeros(len(like), 3)}
+    given |= {} if thresholds is None else {"thresholds": thresholds}
     leaves = {k: t.detach().to(like, copy=True).requires_grad_() for k, t in given.items()}
     made = replace(
         inputs,
         view=replace(inputs.view, background=leaves["background"]),
-        splats=replace(inputs.splats, **{name: leaves[name] for name in _LEARNED}),
+        splats=replace(inputs.splats, **{name: leaves[name] for name in LEARNED}),
         means2d_hook=leaves["hook"],
     )
-    out = engine.rasterize(made, leaves["thresholds"])
+    out = engine.rasterize(made, leaves.get("thresholds"))
     asked = torch.rand(out.image.shape, generator=torch.Generator().manual_seed(0)) - 0.3
-    pressure = torch.tensor(1e3).to(out.fragments_per_pixel)
-    torch.autograd.backward([out.image, out.fragments_per_pixel], [asked.to(out.image), pressure])
-    gradients = {f"gradient of {name}": leaf.grad for name, leaf in leaves.items()}
-    return {name: each.detach().cpu() for name, each in {"picture": out.image, **gradients}.items()}
+    pressed = [out.image] if thresholds is None else [out.image, out.fragments_per_pixel]
+    weights = [asked, torch.tensor(1e3)][: len(pressed)]
+    torch.autograd.backward(pressed, [w.to(o) for w, o in zip(weights, pressed, strict=True)])
+    found = {f"gradient of {k}": leaf.grad for k, leaf in leaves.items() if leaf.grad is not None}
+    return {name: each.detach().cpu() for name, each in {"picture": out.image, **found}.items()}
 
 
-_LEARNED = ("means", "opacities", "scales", "rotations", "sh")
+LEARNED = ("means", "opacities", "scales", "rotations", "sh")
 
 
 def main(device: str) -> int:

@@ -31,7 +31,7 @@ from fragprune_plugins.engines.cuda.engine import CudaEngine
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import FragpruneError
 from fragprune_plugins.slicing.cutting import expect_right
-from fragprune_plugins.types import RasterInputs, Splats, one_line
+from fragprune_plugins.types import RasterInputs, one_line
 from fragprune_plugins.workbench.bench import timing
 from fragprune_plugins.workbench.bench.scene import make_scene, make_view
 from fragprune_plugins.workbench.commands.command import Report
@@ -240,7 +240,6 @@ PEER_PICTURE_DB, PEER_GRADIENT = 50.0, 0.01
 """PSNR of the picture and relative L2 error of each gradient that peers may be off by, which end
 Gaussians at other radii."""
 
-_LEARNED = ("means", "opacities", "scales", "rotations", "sh")
 _FAILURES = (FragpruneError, RuntimeError, TypeError, AttributeError)
 
 
@@ -308,43 +307,29 @@ def _expected(scene: Scene) -> dict[str, Tensor]:
 
 def _drawn(engine: Engine, inputs: RasterInputs, thresholds: Tensor | None) -> dict[str, Tensor]:
     """The picture, its gradients by name, and (H, W) drawn fragments; on the CPU."""
-    if thresholds is None:
-        found = learned(engine, inputs)
-    else:
-        found = comparison.drawn_and_learned(engine, inputs, thresholds)
-        thresholds = thresholds.to(inputs.splats.opacities)
+    found = comparison.drawn_and_learned(engine, inputs, thresholds)
+    cut = None if thresholds is None else thresholds.to(inputs.splats.opacities)
     with torch.no_grad():
-        fragments = engine.rasterize(replace(inputs, counts=True), thresholds).fragments
+        fragments = engine.rasterize(replace(inputs, counts=True), cut).fragments
     assert fragments is not None  # they were asked for
     return found | {"fragments": fragments.cpu()}
-
-
-def learned(engine: Engine, inputs: RasterInputs) -> dict[str, Tensor]:
-    """The picture without thresholds, and its gradients by name; on the CPU."""
-    assert isinstance(inputs.splats, Splats)
-    given = {name: getattr(inputs.splats, name).detach() for name in _LEARNED}
-    leaves = {name: each.clone().requires_grad_() for name, each in given.items()}
-    image = engine.rasterize(replace(inputs, splats=replace(inputs.splats, **leaves)), None).image
-    asked = torch.rand(image.shape, generator=torch.Generator().manual_seed(0)) - 0.3
-    torch.autograd.backward(image, asked.to(image))
-    gradients = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
-    return {name: each.detach().cpu() for name, each in {"picture": image, **gradients}.items()}
 
 
 def peer_differences(engine: Engine, where: str) -> Iterator[str]:
     """Where another rasterizer, which knows no thresholds, draws otherwise than the oracle."""
     inputs = scenes()[0].inputs
-    expected = learned(ReferenceEngine(), comparison.on(inputs, "cpu", torch.float64))
+    wide = comparison.on(inputs, "cpu", torch.float64)
+    expected = comparison.drawn_and_learned(ReferenceEngine(), wide, None)
     try:
-        found = learned(engine, comparison.on(inputs, where))
+        found = comparison.drawn_and_learned(engine, comparison.on(inputs, where), None)
     except _FAILURES as error:
         yield f"it fails: {str(error).splitlines()[0]}"
         return
-    picture = found.pop("picture"), expected.pop("picture")
-    mse = float((picture[0].double() - picture[1]).square().mean())
+    mse = float((found["picture"].double() - expected["picture"]).square().mean())
     if not mse <= 10 ** (-PEER_PICTURE_DB / 10):
         yield f"another picture: its mean squared error is {mse:.2g}"
-    for name, right in expected.items():
+    for name in (f"gradient of {each}" for each in comparison.LEARNED):
+        right = expected[name]
         away = float((found[name].double() - right).norm() / right.norm())
         if not away <= PEER_GRADIENT:
-            yield f"another gradient of {name}: off by {away:.1%}"
+            yield f"another {name}: off by {away:.1%}"
