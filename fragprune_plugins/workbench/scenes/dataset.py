@@ -26,7 +26,6 @@ from fragprune_plugins.workbench.scenes.posed import Lens, Pixels, Posed
 
 _ASPECT_TOLERANCE = 0.01
 OFF_CENTRE = 0.5  # pixels
-_ROWS = 256  # of a picture, composited at a time
 _SEEN = 128  # grey levels of a mask, from which on the photograph is looked at
 _SMALLER = ("images_2", "images_4", "images_8")
 _LAYOUTS = (
@@ -164,8 +163,11 @@ class Photograph(Shot):
         with opened(self.path) as file:
             whole = file.size
             picture = self._fitted(file.convert("RGBA" if file.has_transparency_data else "RGB"))
-        behind = 255 * self.view.background.cpu().numpy()
-        flat = picture[..., :3].copy() if self.opaque else _over(picture, behind)
+        if picture.shape[2] == 4 and not self.opaque:
+            behind = (*(255 * self.view.background).round().int().tolist(), 255)
+            ground = Image.new("RGBA", picture.shape[1::-1], behind)
+            picture = np.array(Image.alpha_composite(ground, Image.fromarray(picture)))
+        flat = np.ascontiguousarray(picture[..., :3])
         if self.mask is not None:
             with opened(self.mask) as file:
                 _expect_aspect(self.mask, file.size, "its photograph", whole)
@@ -187,19 +189,6 @@ class Photograph(Shot):
             picture = Image.fromarray(self.lens.straighten(np.asarray(picture), self.camera))
         size = (self.view.width, self.view.height)
         return np.array(picture if picture.size == size else picture.resize(size))
-
-
-def _over(picture: Pixels, behind: np.ndarray[Any, Any]) -> Pixels:
-    """A picture (H, W, 3 or 4) over a colour (3,) in [0, 255]."""
-    if picture.shape[2] == 3:
-        return picture
-    flat = np.empty((*picture.shape[:2], 3), np.uint8)
-    for begin in range(0, len(picture), _ROWS):  # as floats, a large picture takes gigabytes
-        rows = picture[begin : begin + _ROWS]
-        alpha = rows[..., 3:].astype(np.float32) / 255
-        over = rows[..., :3] * alpha + behind * (1 - alpha)
-        flat[begin : begin + _ROWS] = np.round(over).astype(np.uint8)
-    return flat
 
 
 @dataclass(frozen=True, eq=False)
