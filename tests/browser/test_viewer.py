@@ -14,7 +14,6 @@ from fragprune_plugins import Model, RasterInputs, ThresholdStore, View, load_da
 from fragprune_plugins.workbench.models import formats
 from fragprune_plugins.workbench.view.site import (
     Layer,
-    Shown,
     compacted,
     make_site,
     save_site,
@@ -172,9 +171,9 @@ def test_split_shows_each_side_as_it_is_alone(browser, tmp_path):
 def test_hands_and_keys(browser, tmp_path):
     """Split, maps, cameras, photographs, orbit: each changes what it should, and nothing fails."""
     data, _, splat = tiny.scene(tmp_path / "scene")
-    shown = [Shown(shot.name, shot.view, shot) for shot in load_dataset(data).test]
+    shown = load_dataset(data).test
     store = ThresholdStore.from_falloff(torch.full((len(splat),), 0.3))
-    write_page(tmp_path / "page", [replace(splat, thresholds=store)], shown[0].view, tuple(shown))
+    write_page(tmp_path / "page", [replace(splat, thresholds=store)], shown[0].view, shown)
     with viewing(browser, tmp_path / "page", width=800, height=600) as tab:
         page = tab.page
         page.wait_for_function("() => viewer.counted")

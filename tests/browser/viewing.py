@@ -12,6 +12,7 @@ import torch
 from browser.chromium import Tab, opened, served
 
 from fragprune_plugins import Model, RasterInputs, View, rasterize
+from fragprune_plugins.workbench.scenes.dataset import Shot
 from fragprune_plugins.workbench.view.site import Layer, camera, make_site, save_site
 
 
@@ -27,13 +28,14 @@ class Frame:
     fragments: np.ndarray
 
 
-def write_page(folder: Path, models: list[Model], view: View, cameras: tuple = ()) -> None:
+def write_page(folder: Path, models: list[Model], view: View, shots: list[Shot] = ()) -> None:
     """The viewer of one model with both sides, or of two."""
     if len(models) == 1:
         layers = [Layer("truncated", 0, True), Layer("untruncated", 0, False)]
     else:
         layers = [Layer(str(i), i, m.thresholds is not None) for i, m in enumerate(models)]
-    save_site(folder, make_site("test", models, layers, cameras, view))
+    cameras = [(shot.name, shot.view) for shot in shots]
+    save_site(folder, make_site("test", models, layers, cameras, view, shots))
 
 
 @contextmanager

@@ -30,7 +30,7 @@ from fragprune_plugins.workbench.figures.page import allowed
 from fragprune_plugins.workbench.figures.pictures import picture
 from fragprune_plugins.workbench.models.model import writable_folder
 from fragprune_plugins.workbench.scenes.dataset import Shot
-from fragprune_plugins.workbench.scenes.generated import bounds
+from fragprune_plugins.workbench.scenes.generated import Named, bounds
 from fragprune_plugins.workbench.view.packing import compact, pack
 
 Site = dict[str, bytes]  # names of files, with slashes, and what they hold
@@ -50,24 +50,16 @@ class Layer:
     truncated: bool  # whether its thresholds apply
 
 
-@dataclass(frozen=True)
-class Shown:
-    """A camera of the page's list, and the photograph that it took, if there is one."""
-
-    name: str
-    view: View
-    photograph: Shot | None = None
-
-
 def make_site(
     title: str,
     models: Sequence[Model],
     layers: Sequence[Layer],
-    cameras: Sequence[Shown],
+    cameras: Named,
     start: View,
+    photographs: Sequence[Shot] = (),
 ) -> Site:
     """All files of a viewer: of one or two layers from left to right, cameras to choose from, if
-    there are any, and the first camera, whose background is the page's.
+    there are any, the first camera, whose background is the page's, and what the cameras took.
     """
     site = {each.name: each.read_bytes() for each in sorted(STATIC.iterdir()) if each.is_file()}
     described = []
@@ -77,17 +69,17 @@ def make_site(
         described.append({"file": file, **facts})
     centre, radius = bounds(models[0])
     listed = []
-    for number, each in enumerate(cameras):
-        name = f"photographs/{number:04d}.jpg" if each.photograph else None
-        listed.append({"name": each.name, **camera(each.view), "photograph": name})
-        if name and each.photograph:
-            site[name] = _jpeg(each.photograph)
+    for number, (name, view) in enumerate(cameras):
+        taken = f"photographs/{number:04d}.jpg" if photographs else None
+        listed.append({"name": name, **camera(view), "photograph": taken})
+        if taken:
+            site[taken] = _jpeg(photographs[number])
     scene = {
         "title": title,
         "models": described,
         "layers": [vars(each) for each in layers],
         "cameras": listed,
-        "start": listed[0] if cameras and start is cameras[0].view else camera(start),
+        "start": listed[0] if cameras and start is cameras[0][1] else camera(start),
         "background": start.background.tolist(),
         "up": [0.0, -1.0, 0.0],  # as in COLMAP's worlds
         "centre": centre.tolist(),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import webbrowser
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,8 @@ from fragprune_plugins.workbench.figures.viewing import overview
 from fragprune_plugins.workbench.figures.wording import quoted
 from fragprune_plugins.workbench.models.model import load, writable_folder
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
-from fragprune_plugins.workbench.scenes.dataset import load_photographs
+from fragprune_plugins.workbench.scenes.dataset import Shot, load_photographs
+from fragprune_plugins.workbench.scenes.generated import Named
 from fragprune_plugins.workbench.scenes.output import cameras_of, output_folder
 from fragprune_plugins.workbench.view import site as sites
 
@@ -49,11 +51,11 @@ def view(
             each.reverse()
     scene = SceneOptions(data, white_background=white_background)
     scene = opening.over_its_background(model, scene)
-    shown = _cameras(scene, cameras or cameras_of(model), paths)
-    start = shown[0].view if shown else overview(models[-1])
+    shown, shots = _cameras(scene, cameras or cameras_of(model), paths)
+    start = shown[0][1] if shown else overview(models[-1])
     if not shown:
         start.background.fill_(float(scene.white_background))
-    site = sites.make_site(model.name, models, _layers(paths, truncated), shown, start)
+    site = sites.make_site(model.name, models, _layers(paths, truncated), shown, start, shots)
     facts: dict[str, Any] = {
         "model": str(model),
         "compare": None if other is None else str(other),
@@ -114,15 +116,15 @@ def _told_apart(left: Path, right: Path) -> tuple[str, str]:
     return str(left), str(right)
 
 
-def _cameras(scene: SceneOptions, cameras: Path | None, models: list[Path]) -> list[sites.Shown]:
-    """The cameras of the page's list: held-out ones of a scene, or all of a file."""
+def _cameras(
+    scene: SceneOptions, cameras: Path | None, models: list[Path]
+) -> tuple[Named, Sequence[Shot]]:
+    """The cameras of the page's list: held-out ones of a scene, and what they took, or a file's."""
     if scene.data is not None:
         shots = load_photographs(opening.drawn_as_trained(scene, *models)).test
-        return [sites.Shown(shot.name, shot.view, shot) for shot in shots]
-    if cameras is None:
-        return []
-    named = load_cameras(cameras, white_background=scene.white_background)
-    return [sites.Shown(name, camera) for name, camera in named]
+        return [(shot.name, shot.view) for shot in shots], shots
+    white = scene.white_background
+    return load_cameras(cameras, white_background=white) if cameras else [], ()
 
 
 def _serve(site: sites.Site, port: int, *, browse: bool) -> str:
