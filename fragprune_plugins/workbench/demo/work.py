@@ -18,7 +18,7 @@ from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.commands.opening import open_engine
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.demo.scene import make_scene
-from fragprune_plugins.workbench.figures import records, wording
+from fragprune_plugins.workbench.figures import wording
 from fragprune_plugins.workbench.models.model import writable_folder
 from fragprune_plugins.workbench.report.page import save, save_banner
 from fragprune_plugins.workbench.report.work import results
@@ -42,28 +42,18 @@ def demo(*, out: Path, iters: int, seed: int, engine: EngineOptions) -> Report:
     make_scene(out / "scene")
     words = host_command((out / "scene").resolve(), (out / "model").resolve(), iters, seed)
     settings = Settings(iterations=iters // 2, seed=seed)
-    train = partial(run, host_command=tuple(words), adapter=None, from_iter=None, engine=engine)
+    train = partial(run, host_command=tuple(words), engine=engine)
     with contextlib.redirect_stdout(sys.stderr):
-        then = f"then with a cutoff for every Gaussian for {settings.iterations}"
+        then = f"then for {settings.iterations} without cutoffs, the control"
         say(f"1/3  Training for {iters} iterations, {then}")
-        report = train(stage="auto", settings=settings, again=True, trust=False)
-        say(f"2/3  The control: the same {settings.iterations} iterations without cutoffs")
-        control = replace(settings, goal=Control())
-        train(stage="finetune", settings=control, again=True, trust=False)
+        train(stage="auto", settings=replace(settings, goal=Control()))
+        say(f"2/3  The same {settings.iterations} iterations with a cutoff for every Gaussian")
+        report = train(stage="finetune", settings=settings)
     say("3/3  Drawing the pictures")
-    data = report.data | {"files": write_page(out, engine)}
-    data["control"] = records.control_of(data, records.files(out / "model", below=True))
-    data["seconds"] = time.perf_counter() - started
-    lines = [
-        "",
-        wording.describe(wording.columns_of(data)),
-        "",
-        wording.outcome("run", data, data["control"]),
-        *wording.begun(data),
-        f"Took {data['seconds']:.0f} s. Open {out / PAGE} for the pictures. "
-        f"To turn it: fragprune view {wording.quoted(out)}",
-    ]
-    return Report(data, "\n".join(lines))
+    files = write_page(out, engine)
+    data = report.data | {"files": files, "seconds": time.perf_counter() - started}
+    line = f"Took {data['seconds']:.0f} s. Open {out / PAGE} for the pictures."
+    return Report(data, f"\n{report.text}\n{line}", report.exit_code)
 
 
 def _expect_empty(out: Path) -> None:

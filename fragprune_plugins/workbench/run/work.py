@@ -52,13 +52,13 @@ _CONTROL = (  # joint learning has no model of before
 def run(
     *,
     host_command: tuple[str, ...],
-    adapter: str | None,
     stage: Any,
-    from_iter: int | None,
     settings: Settings,
     engine: EngineOptions,
-    again: bool,
-    trust: bool,
+    adapter: str | None = None,
+    from_iter: int | None = None,
+    again: bool = False,
+    trust: bool = False,
 ) -> Report:
     """Do what ``fragprune run`` promises; its options are the arguments."""
     opening.bound_threads(engine.threads)
