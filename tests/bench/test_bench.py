@@ -78,7 +78,8 @@ class Recorder:
 
 def case(kind: timing.Pass = "forward", cut: float | None = None) -> Case:
     thresholds = None if cut is None else torch.full((200,), cut)
-    return Case("tiny", make_view(40, 30), make_scene(200).splats(), kind, thresholds)
+    inputs = RasterInputs(make_view(40, 30), make_scene(200).splats(), planes=())
+    return Case("tiny", inputs, thresholds, kind)
 
 
 def test_one_row_a_case_and_engine() -> None:

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from fragprune_plugins.engines import create_engine
+from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.bench import timing
 from fragprune_plugins.workbench.bench.scene import make_scene, make_view
 from fragprune_plugins.workbench.bench.timing import Case
@@ -68,7 +69,8 @@ def test_every_timed_frame_of_a_measurement_waits(events, truth, dataset):
     ("kind", "frame"), [("forward", ["draw"]), ("forward_backward", ["draw", "backward"])]
 )
 def test_every_timed_frame_of_the_bench_waits(events, kind, frame):
-    case = Case("tiny", make_view(24, 16), make_scene(60).splats(), kind)
+    inputs = RasterInputs(make_view(24, 16), make_scene(60).splats(), planes=())
+    case = Case("tiny", inputs, kind=kind)
     timing.measure([case], [Notes(events)], repeats=2)
     assert events == frame + 2 * ["idle cpu", *frame, "idle cpu"]
 

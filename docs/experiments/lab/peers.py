@@ -189,8 +189,9 @@ def _table(sizes: Sequence[str], count: int, repeats: int) -> Iterator[str]:
     splats = replace(scene, sh=scene.sh[:, :1].contiguous(), sh_degree=0)
     for size in sizes:
         view = make_view(*map(int, size.split("x")))
-        (ours,) = measure([Case("peers", view, splats, "forward")], [engine], repeats=repeats)
-        truth = engine.rasterize(RasterInputs(view, splats, planes=()), None).image
+        inputs = RasterInputs(view, splats, planes=())
+        (ours,) = measure([Case("peers", inputs)], [engine], repeats=repeats)
+        truth = engine.rasterize(inputs, None).image
         yield f"{size} fragprune: {ours['ms_median']:.2f} ms median, {ours['ms_min']:.2f} min"
         for name in installed():
             row = time_peer(name, splats, view, truth, repeats=repeats)

@@ -7,7 +7,7 @@ import os
 import platform
 import statistics
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -18,7 +18,7 @@ from torch import Tensor
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.cpu import binding
 from fragprune_plugins.plugins.hooks import drawn_by
-from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats, View, one_line
+from fragprune_plugins.types import RasterInputs, RasterOutputs, one_line
 from fragprune_plugins.workbench.bench.scene import make_scene, make_view
 from fragprune_plugins.workbench.figures.clock import standard_error, synchronize, timed
 
@@ -27,38 +27,29 @@ PASSES: tuple[Pass, ...] = get_args(Pass)
 TRUNCATION = 16 / 255  # of all Gaussians in truncated rows; leaves 0.63 of the fragments
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Case:
-    """A rasterization to time."""
+    """A rasterization to time, or to hold against another."""
 
     scene: str
-    view: View  # on the Gaussians' device, which does the work
-    splats: Splats
-    kind: Pass
-    thresholds: Tensor | None = None
-    rules: Mapping[str, Any] = field(default_factory=dict)  # ``Model.rules`` to draw by
+    inputs: RasterInputs  # on the device that does the work
+    thresholds: Tensor | None = None  # (N,), or None for no cutoffs
+    kind: Pass = "forward"
 
     __repr__ = one_line
 
-    @property
-    def device(self) -> torch.device:
-        """Where the Gaussians are."""
-        return self.splats.device
 
-
-def cases(
-    scene: str, view: View, splats: Splats, cut: Tensor, rules: Mapping[str, Any]
-) -> list[Case]:
+def cases(scene: str, inputs: RasterInputs, cut: Tensor, rules: Mapping[str, Any]) -> list[Case]:
     """Both passes of a scene, each without truncation, and then with thresholds (N,) and rules."""
-    plain = [Case(scene, view, splats, kind) for kind in PASSES]
-    return [each for case in plain for each in (case, replace(case, thresholds=cut, rules=rules))]
+    ways = ((inputs, None), (replace(inputs, **rules), cut))
+    return [Case(scene, drawn, tau, kind) for kind in PASSES for drawn, tau in ways]
 
 
 def generated(count: int, size: tuple[int, int], device: torch.device | str) -> list[Case]:
     """The cases of the bench scene with so many Gaussians, at a size."""
     splats, view = make_scene(count).to(device).splats(), make_view(*size).to(device)
     cut = torch.full_like(splats.opacities, TRUNCATION)
-    return cases(f"bench-{count}", view, splats, cut, {})
+    return cases(f"bench-{count}", RasterInputs(view, splats, planes=()), cut, {})
 
 
 def measure(
@@ -91,11 +82,12 @@ class _Job:
         self.case, self.engine, self.draw = case, engine, _prepare(case, engine)
         self.times: list[float] = []
         self.stages: list[dict[str, float]] = []
-        self.outputs, self.peak = _with_peak(self.draw, case.device)
+        self.device = case.inputs.splats.device
+        self.outputs, self.peak = _with_peak(self.draw, self.device)
 
     def time(self) -> None:
         """Draw once more, by the clock."""
-        outputs, spent = timed(self.draw, self.case.device)
+        outputs, spent = timed(self.draw, self.device)
         parts = dict(outputs.stages or {})
         if self.case.kind == "forward_backward" and parts:
             parts["backward"] = spent - sum(parts.values())
@@ -105,17 +97,18 @@ class _Job:
     def result(self, compared: Tensor) -> dict[str, Any]:
         """The figures, with the difference from another picture."""
         case, outputs, median = self.case, self.outputs, statistics.median(self.times)
+        view = case.inputs.view
         drawn = float(outputs.fragments_per_pixel.detach())
-        fragments = drawn * case.view.width * case.view.height
+        fragments = drawn * view.width * view.height
         names = self.stages[0]
         return {
             "scene": case.scene,
-            "width": case.view.width,
-            "height": case.view.height,
-            "gaussians": len(case.splats),
+            "width": view.width,
+            "height": view.height,
+            "gaussians": len(case.inputs.splats),
             "pass": case.kind,
             "engine": self.engine.name,
-            "device": str(case.device),
+            "device": str(self.device),
             "threads": torch.get_num_threads(),
             "truncated": case.thresholds is not None,
             "fragments_per_pixel": drawn,
@@ -132,18 +125,16 @@ class _Job:
 
 def _prepare(case: Case, engine: Engine) -> Callable[[], RasterOutputs]:
     """Make a function that draws once, optionally with gradients of a fixed random loss."""
-    inputs = RasterInputs(case.view, case.splats, planes=(), **case.rules)
+    inputs, cut, splats = case.inputs, case.thresholds, case.inputs.splats
     if case.kind == "forward":
-        return torch.no_grad()(partial(drawn_by, engine, inputs, case.thresholds))
+        return torch.no_grad()(partial(drawn_by, engine, inputs, cut))
     names = ("means", "opacities", "scales", "rotations", "sh")
-    leaves = {n: getattr(case.splats, n).detach().clone().requires_grad_(True) for n in names}
-    hook = torch.zeros(len(case.splats), 3, device=case.device, requires_grad=True)
-    cut = case.thresholds
+    leaves = {n: getattr(splats, n).detach().clone().requires_grad_(True) for n in names}
+    hook = torch.zeros(len(splats), 3, device=splats.device, requires_grad=True)
     thresholds = None if cut is None else cut.clone().requires_grad_(True)
-    splats = replace(case.splats, **leaves)
-    inputs = RasterInputs(case.view, splats, hook, planes=(), **case.rules)
+    inputs = replace(inputs, splats=replace(splats, **leaves), means2d_hook=hook)
     stream = torch.Generator().manual_seed(0)
-    weight = torch.randn(3, case.view.height, case.view.width, generator=stream).to(case.device)
+    weight = torch.randn(3, inputs.view.height, inputs.view.width, generator=stream).to(hook)
 
     def draw_and_differentiate() -> RasterOutputs:
         for leaf in (*leaves.values(), hook, thresholds):

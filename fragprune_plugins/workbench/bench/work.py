@@ -62,10 +62,11 @@ def _of_model(
     cases: list[timing.Case] = []
     for width, height in sizes:
         view = replace(first, width=width, height=height)
-        cut = thresholds_for(RasterInputs(view, splats), loaded.thresholds)
+        inputs = RasterInputs(view, splats, planes=())
+        cut = thresholds_for(inputs, loaded.thresholds)
         if cut is None:
             cut = torch.full_like(splats.opacities, timing.TRUNCATION)
-        cases += timing.cases(model.stem, view, splats, cut.detach(), loaded.rules)
+        cases += timing.cases(model.stem, inputs, cut.detach(), loaded.rules)
     return cases
 
 

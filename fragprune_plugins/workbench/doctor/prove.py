@@ -31,9 +31,10 @@ from fragprune_plugins.engines.cuda.engine import CudaEngine
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import FragpruneError
 from fragprune_plugins.slicing.cutting import expect_right
-from fragprune_plugins.types import RasterInputs, one_line
+from fragprune_plugins.types import RasterInputs
 from fragprune_plugins.workbench.bench import timing
 from fragprune_plugins.workbench.bench.scene import make_scene, make_view
+from fragprune_plugins.workbench.bench.timing import Case
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.doctor import emulated, peers
 from fragprune_plugins.workbench.doctor.emulated import EmulatedDevice, find_compiler, version_of
@@ -134,7 +135,7 @@ def _emulation(say: Callable[[str], None]) -> dict[str, Any]:
         engine.capacity = 1 << 13  # each entry that there is room for costs time
         rows = []
         for scene in scenes():
-            say(f"emulating the cuda kernels: {scene.name}")
+            say(f"emulating the cuda kernels: {scene.scene}")
             rows.append(held(engine, "cpu", scene))
         differences = [each for row in rows for each in row["differences"]]
         say("emulating the cuda kernels: a cut in time")
@@ -243,18 +244,8 @@ Gaussians at other radii."""
 _FAILURES = (FragpruneError, RuntimeError, TypeError, AttributeError)
 
 
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """What is drawn."""
-
-    name: str
-    inputs: RasterInputs
-    thresholds: Tensor | None  # (N,), or None for no cutoffs
-    __repr__ = one_line
-
-
 @cache
-def scenes() -> tuple[Scene, ...]:
+def scenes() -> tuple[Case, ...]:
     """Always the same, float32 on the CPU; small, for the oracle and the emulation are slow.
 
     In the last, several blocks sort, and tiles' lists are longer than a block's 256 threads.
@@ -262,31 +253,31 @@ def scenes() -> tuple[Scene, ...]:
     inputs, thresholds = comparison.scene(200, (70, 50), 3.0)
     timed = RasterInputs(make_view(64, 48), make_scene(6000).splats())
     return (
-        Scene("cutoffs", inputs, thresholds),
-        Scene("no cutoffs", inputs, None),
-        Scene("a stop", replace(inputs, stop=0.05), thresholds),
-        Scene("the timed scene, small", timed, torch.full((6000,), timing.TRUNCATION)),
+        Case("cutoffs", inputs, thresholds),
+        Case("no cutoffs", inputs, None),
+        Case("a stop", replace(inputs, stop=0.05), thresholds),
+        Case("the timed scene, small", timed, torch.full((6000,), timing.TRUNCATION)),
     )
 
 
-def held(engine: Engine, where: str, scene: Scene) -> dict[str, Any]:
+def held(engine: Engine, where: str, scene: Case) -> dict[str, Any]:
     """A row of the proof: what an engine of ours draws of a scene, and what is wrong with it."""
     expected = _expected(scene)
     differences, counted = [], None
     try:
         found = _drawn(engine, comparison.on(scene.inputs, where), scene.thresholds)
     except _FAILURES as error:
-        differences.append(f"{scene.name}: it fails: {str(error).splitlines()[0]}")
+        differences.append(f"{scene.scene}: it fails: {str(error).splitlines()[0]}")
     else:
         fragments = found.pop("fragments")
         counted = float(fragments.double().mean())
         right = {name: each for name, each in expected.items() if name != "fragments"}
-        differences += comparison.differences(scene.name, found, right)
+        differences += comparison.differences(scene.scene, found, right)
         off, total = int((fragments != expected["fragments"]).sum()), fragments.numel()
         if off > MISCOUNTED * total:
-            differences.append(f"{scene.name}, fragments: {off} of {total} pixels count others")
+            differences.append(f"{scene.scene}, fragments: {off} of {total} pixels count others")
     return {
-        "scene": scene.name,
+        "scene": scene.scene,
         "gaussians": len(scene.inputs.splats),
         "width": scene.inputs.view.width,
         "height": scene.inputs.view.height,
@@ -299,7 +290,7 @@ def held(engine: Engine, where: str, scene: Scene) -> dict[str, Any]:
 
 
 @cache
-def _expected(scene: Scene) -> dict[str, Tensor]:
+def _expected(scene: Case) -> dict[str, Tensor]:
     """What the oracle draws."""
     wide = comparison.on(scene.inputs, "cpu", torch.float64)
     return _drawn(ReferenceEngine(), wide, scene.thresholds)
