@@ -15,7 +15,6 @@ from fragprune_plugins.engines.cpu.engine import CpuEngine
 from fragprune_plugins.engines.cuda import comparison
 from fragprune_plugins.errors import EngineError
 from fragprune_plugins.workbench.doctor import peers, prove
-from fragprune_plugins.workbench.doctor.prove import Contestant
 
 PACKAGE = "diff_gaussian_rasterization"
 EMULATION = {"compiler": "g++", "not_proved": None, "differences": [], "scenes": []}
@@ -71,8 +70,8 @@ def test_every_engine_here_agrees_and_is_timed():
 
 @pytest.mark.parametrize("change", CHANGES)
 def test_who_draws_otherwise_is_named_and_not_timed(monkeypatch, change):
-    wrong, right = Contestant("wrong", Wrong(CHANGES[change])), Contestant("right", CpuEngine())
-    monkeypatch.setattr(prove, "_ours", lambda kind: iter([wrong, right]))
+    engines = {"wrong": Wrong(CHANGES[change]), "right": CpuEngine()}
+    monkeypatch.setattr(prove, "_ours", lambda kind: engines)
     report = prove.prove(lambda text: None, repeats=2)
     assert report.exit_code == 1
     assert [bool(check["differences"]) for check in report.data["checks"]] == [True, False]
@@ -119,10 +118,9 @@ def host(monkeypatch):
 
 
 def test_a_hosts_own_rasterizer_that_agrees_is_timed_in_turns(host):
-    peer = Contestant("host", peers.peer(PACKAGE), ours=False)
-    assert prove._check(peer, "cpu")["differences"] == []
-    ours = Contestant("ours", CpuEngine())
-    rows = list(prove._times([ours, peer], "cpu", 2, lambda text: None))
+    engines = {"ours": CpuEngine(), "host": peers.peer(PACKAGE)}
+    assert prove._check("host", engines["host"], "cpu")["differences"] == []
+    rows = list(prove._times(engines, "cpu", 2, lambda text: None))
     assert [row["engine"] for row in rows if row["round"] == "peers"] == ["ours", "host"] * 2
     assert all(isnan(row["fragments_per_pixel"]) for row in rows if row["engine"] == "host")
     assert all(row["difference"] < 1e-6 for row in rows if row["round"] == "peers")
@@ -130,8 +128,7 @@ def test_a_hosts_own_rasterizer_that_agrees_is_timed_in_turns(host):
 
 def test_a_hosts_rasterizer_that_draws_otherwise_is_named(host):
     host[0][0] = 1.05
-    peer = Contestant("host", peers.peer(PACKAGE), ours=False)
-    (picture, *gradients) = prove._check(peer, "cpu")["differences"]
+    (picture, *gradients) = prove._check("host", peers.peer(PACKAGE), "cpu")["differences"]
     assert "another picture" in picture
     assert any("gradient of sh" in line for line in gradients)
 
@@ -140,8 +137,7 @@ def test_another_rasterizer_by_the_same_name_is_refused(host):
     fields = ("image_height", "kernel_size")
     module = stand_ins.rasterizer(PACKAGE, fields, None)
     host[1].GaussianRasterizationSettings = module.GaussianRasterizationSettings
-    peer = peers.peer(PACKAGE)
-    (said,) = prove._check(Contestant("host", peer, ours=False), "cpu")["differences"]
+    (said,) = prove._check("host", peers.peer(PACKAGE), "cpu")["differences"]
     assert "kernel_size" in said
 
 

@@ -11,9 +11,9 @@ import datetime
 import hashlib
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,7 @@ from fragprune_plugins.workbench.bench.timing import Case
 from fragprune_plugins.workbench.commands.command import Report
 from fragprune_plugins.workbench.doctor import emulated, peers
 from fragprune_plugins.workbench.doctor.emulated import EmulatedDevice, find_compiler, version_of
+from fragprune_plugins.workbench.doctor.peers import Peer
 
 FORMAT = "fragprune-proof 2"
 
@@ -51,23 +52,14 @@ _NOT_EMULATED = "no C++17 compiler on Linux: install g++, or name one with CXX, 
 _CLOCKS = ("driver_version", "clocks.sm", "clocks.max.sm", "clocks.mem", "temperature.gpu")
 
 
-@dataclass(frozen=True)
-class Contestant:
-    """Who is to be proved."""
-
-    name: str
-    engine: Engine
-    ours: bool = True  # it knows thresholds, and must equal the oracle in everything
-
-
 def prove(say: Callable[[str], None] | None = None, repeats: int = 9) -> Report:
     """Check, then time ``repeats`` frames of each row; ``say``, else stderr, is told how far."""
     say = say or partial(click.echo, err=True)
     kind = "cuda" if torch.cuda.is_available() else "cpu"
-    contestants, left_out = list(_ours(kind)), {}
+    engines, left_out = _ours(kind), {}
     for name in peers.installed():
         if kind == "cuda":
-            contestants.append(Contestant(name, peers.peer(name), ours=False))
+            engines[name] = peers.peer(name)
         else:
             left_out[name] = "it runs on a GPU only, and torch sees none"
     if kind == "cuda" and (missing := driver.missing()) is not None:
@@ -75,11 +67,11 @@ def prove(say: Callable[[str], None] | None = None, repeats: int = 9) -> Report:
     if not binding.available():
         left_out["cpu"] = str(binding.chosen())
     checks = []
-    for each in contestants:
-        say(f"checking {each.name}")
-        checks.append(_check(each, kind))
+    for name, engine in engines.items():
+        say(f"checking {name}")
+        checks.append(_check(name, engine, kind))
     emulation = _emulation(say)
-    passed = [c for c, check in zip(contestants, checks, strict=True) if not check["differences"]]
+    passed = {c["name"]: engines[c["name"]] for c in checks if not c["differences"]}
     data: dict[str, Any] = {
         "format": FORMAT,
         "fragprune": VERSION,
@@ -105,21 +97,22 @@ def _proved(data: dict[str, Any]) -> bool:
     return bool(ours) and kernels_held and not wrong
 
 
-def _ours(kind: str) -> Iterator[Contestant]:
-    """Our engines that run here."""
-    for build in binding.usable_builds():
-        yield Contestant(f"cpu ({build})", CpuEngine(binding.open_build(build)))
+def _ours(kind: str) -> dict[str, Engine]:
+    """Our engines that run here, which know thresholds, and must equal the oracle in everything."""
+    builds = binding.usable_builds()
+    found: dict[str, Engine] = {f"cpu ({b})": CpuEngine(binding.open_build(b)) for b in builds}
     if kind == "cuda" and driver.missing() is None:
-        yield Contestant("cuda", CudaEngine())
+        found["cuda"] = CudaEngine()
+    return found
 
 
-def _check(contestant: Contestant, kind: str) -> dict[str, Any]:
+def _check(name: str, engine: Engine, kind: str) -> dict[str, Any]:
     """Every difference from the oracle in float64; empty if there is none."""
-    where = "cpu" if isinstance(contestant.engine, CpuEngine) else kind
-    found: dict[str, Any] = {"name": contestant.name, "ours": contestant.ours}
-    if not contestant.ours:
-        return found | {"differences": list(peer_differences(contestant.engine, where))}
-    rows = [held(contestant.engine, where, scene) for scene in scenes()]
+    where = "cpu" if isinstance(engine, CpuEngine) else kind
+    found: dict[str, Any] = {"name": name, "ours": not isinstance(engine, Peer)}
+    if isinstance(engine, Peer):
+        return found | {"differences": list(peer_differences(engine, where))}
+    rows = [held(engine, where, scene) for scene in scenes()]
     differences = [each for row in rows for each in row["differences"]]
     return found | {"differences": differences, "scenes": rows}
 
@@ -148,23 +141,22 @@ def _emulation(say: Callable[[str], None]) -> dict[str, Any]:
 
 
 def _times(
-    contestants: Sequence[Contestant], kind: str, repeats: int, say: Callable[[str], None]
+    engines: Mapping[str, Engine], kind: str, repeats: int, say: Callable[[str], None]
 ) -> Iterator[dict[str, Any]]:
     """Rows of all that passed and draw on the device, timed in turns."""
-    timed = [c for c in contestants if kind == "cpu" or not isinstance(c.engine, CpuEngine)]
-    ours = [each for each in timed if each.ours]
+    timed = {k: e for k, e in engines.items() if kind == "cpu" or not isinstance(e, CpuEngine)}
+    ours = {name: each for name, each in timed.items() if not isinstance(each, Peer)}
     for count, size in SCENES[kind]:
         cases = timing.generated(count, size, kind)
         plain = [case for case in cases if case.thresholds is None]
         rounds = [("truncation", cases, ours)]
         rounds += [("peers", plain, timed)] if len(timed) > len(ours) else []
-        for what, some, engines in rounds:
-            if not engines:
+        for what, some, turns in rounds:
+            if not turns:
                 continue
             say(f"timing {what}: {count:,} Gaussians at {size[0]}x{size[1]}")
-            rows = timing.measure(some, [each.engine for each in engines], repeats=repeats)
-            names = [each.name for _ in some for each in engines]
-            for name, row in zip(names, rows, strict=True):
+            rows = timing.measure(some, [*turns.values()], repeats=repeats)
+            for name, row in zip([*turns] * len(some), rows, strict=True):
                 yield {"round": what} | row | {"engine": name}
 
 
