@@ -146,7 +146,7 @@ def _second_length(array: Tensor | None) -> int:
 
 # ---- gradients ---------------------------------------------------------------------------------
 
-_LEARNABLE = tuple(name for name, *_ in binding.InputGrads._fields_[1:])
+_LEARNABLE = tuple(name for name, *_ in binding.InputGrads._fields_)
 _DIFFERENTIABLE = ("image", "invdepth", "alpha", "features", "surface", "fragments_per_pixel")
 _FELT_BY = dict.fromkeys(_DIFFERENTIABLE, frozenset(_LEARNABLE))
 

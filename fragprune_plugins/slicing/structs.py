@@ -12,7 +12,6 @@ class Spacetime(binding.Sized):
     """fragprune_spacetime."""
 
     _fields_ = (
-        ("size", ctypes.c_uint32),
         ("threads", ctypes.c_int32),
         *binding.several(ctypes.c_float, "timestamp duration prefilter_var scale_modifier"),
         *binding.several(ctypes.c_int32, "sh_degree sh_degree_t sh_coefficients"),
@@ -27,17 +26,13 @@ class Spacetime(binding.Sized):
 class Sliced(binding.Sized):
     """fragprune_sliced."""
 
-    _fields_ = (
-        ("size", ctypes.c_uint32),
-        *binding.pointers("means cov3d opacities colors present"),
-    )
+    _fields_ = (*binding.pointers("means cov3d opacities colors present"),)
 
 
 class SpacetimeGrads(binding.Sized):
     """fragprune_spacetime_grads."""
 
     _fields_ = (
-        ("size", ctypes.c_uint32),
         *binding.pointers("means opacities times scales scales_t rotations rotations_r cov3d sh"),
     )
 

@@ -95,7 +95,7 @@ def replay(path: Path) -> None:
     calls, address = ctypes.CDLL(frame["library"]), ctypes.addressof
     arrays = {k: ctypes.create_string_buffer(v, len(v)) for k, v in frame["arrays"].items()}
     lengths = {name: len(raw) // 4 for name, raw in frame["arrays"].items()}
-    scalars = {k: v for k, v in frame["scalars"].items() if k != "size"}
+    scalars = frame["scalars"]
     n, pixels = scalars["count"], scalars["width"] * scalars["height"]
     given = binding.Inputs(
         **scalars,

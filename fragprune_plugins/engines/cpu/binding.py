@@ -52,13 +52,6 @@ def address(value: Any) -> Any:
     return value.data_ptr() if value.numel() else None
 
 
-class Sized(Named):
-    """A struct whose first field is its own size."""
-
-    def __init__(self, **fields: Any) -> None:
-        super().__init__(size=ctypes.sizeof(type(self)), **fields)
-
-
 def several(kind: Any, names: str) -> tuple[tuple[str, Any], ...]:
     """Fields of a struct that are of one kind, by their names in one string."""
     return tuple((name, kind) for name in names.split())
@@ -67,6 +60,16 @@ def several(kind: Any, names: str) -> tuple[tuple[str, Any], ...]:
 def pointers(names: str) -> tuple[tuple[str, Any], ...]:
     """Fields of a struct that are addresses, likewise."""
     return several(_POINTER, names)
+
+
+class Sized(Named):
+    """A struct whose first field is its own size."""
+
+    _fields_ = several(ctypes.c_uint32, "size")
+
+    def __init__(self, **fields: Any) -> None:
+        super().__init__(**fields)
+        self.size = ctypes.sizeof(self)
 
 
 class Lengths(Named):
@@ -87,7 +90,6 @@ class Inputs(Sized):
     """fragprune_inputs."""
 
     _fields_ = (
-        ("size", ctypes.c_uint32),
         *several(ctypes.c_int32, "threads width height"),
         *several(ctypes.c_float, "tan_fov_x tan_fov_y scale_modifier dilation near alpha_max stop"),
         *several(ctypes.c_int32, "compensation cap_gradient absolute_gradient sh_degree"),
@@ -104,7 +106,6 @@ class Outputs(Sized):
     """fragprune_outputs."""
 
     _fields_ = (
-        ("size", ctypes.c_uint32),
         *pointers("image invdepth alpha radii features fragments fragments_per_gaussian"),
         *pointers("weights_per_gaussian wins_per_gaussian winners surface"),
         *several(ctypes.c_int64, "drawn evaluated entries"),
@@ -116,7 +117,6 @@ class OutputGrads(Sized):
     """fragprune_output_grads."""
 
     _fields_ = (
-        ("size", ctypes.c_uint32),
         ("fragments_per_pixel", ctypes.c_float),
         *pointers("image invdepth alpha features surface"),
     )
@@ -126,7 +126,6 @@ class InputGrads(Sized):
     """fragprune_input_grads."""
 
     _fields_ = (
-        ("size", ctypes.c_uint32),
         *pointers("means hook opacities scales rotations cov3d sh sh_rest colors features"),
         *pointers("thresholds means2d conics depths background"),
     )
@@ -136,7 +135,6 @@ class Photometric(Sized):
     """fragprune_photometric."""
 
     _fields_ = (
-        ("size", ctypes.c_uint32),
         *several(ctypes.c_int32, "threads channels height width"),
         *several(ctypes.c_float, "l1_weight ssim_weight"),
         *pointers("image target gradient workspace"),
