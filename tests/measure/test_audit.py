@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -23,7 +22,7 @@ from fragprune_plugins.workbench.audit.audit import (
     audit,
     weigh,
 )
-from reference_renderer.composite import transmittances
+from reference_renderer.render import Blended
 
 ENGINE = engine_for("auto", "cpu")
 SIZES = ((24, 32), (60, 40))
@@ -38,15 +37,8 @@ def column(seed, count):
 
     drawn = uniform(count, 16) < 0.7
     alpha = uniform(count, 16).pow(4).clamp(1 / 255, 0.99) * drawn
-    light = transmittances(alpha)[:-1]
-    return SimpleNamespace(
-        rows=torch.arange(count),
-        alpha=alpha,
-        drawn=drawn,
-        light=light,
-        opacity=uniform(count).clamp(min=0.02),
-        color=1.3 * uniform(count, 3),
-    )
+    opacity, color = uniform(count).clamp(min=0.02), 1.3 * uniform(count, 3)
+    return Blended(torch.arange(count), alpha, drawn, opacity, color)
 
 
 def composed(tile, kept, background):
@@ -64,7 +56,7 @@ def composed(tile, kept, background):
 @given(st.integers(0, 1000), st.integers(1, 20))
 def test_idle_fragments_can_go_alone_and_together(seed, count):
     tile, background = column(seed, count), torch.tensor([0.1, 0.9, 0.4], dtype=torch.float64)
-    found = weigh(tile, background)
+    alone, together, _ = weigh(tile, background)
     whole = composed(tile, tile.drawn, background)
     for row in range(count):
         kept = tile.drawn.clone()
@@ -72,17 +64,17 @@ def test_idle_fragments_can_go_alone_and_together(seed, count):
         moved = (composed(tile, kept, background) - whole).abs().amax(dim=0)
         unclear = (moved - HALF_LEVEL).abs() < 1e-9
         expected = tile.drawn[row] & (moved < HALF_LEVEL)
-        assert torch.equal(found.alone[row] | unclear, expected | unclear)
-    rest = composed(tile, tile.drawn & ~found.together, background)
+        assert torch.equal(alone[row] | unclear, expected | unclear)
+    rest = composed(tile, tile.drawn & ~together, background)
     assert float((rest - whole).abs().max()) <= HALF_LEVEL + 1e-12
-    assert not (found.together & ~found.drawn).any()
+    assert not (together & ~tile.drawn).any()
 
 
 @settings(max_examples=20)
 @given(st.integers(0, 1000))
 def test_together_are_as_many_as_the_bound_allows(seed):
     tile, background = column(seed, 20), torch.zeros(3, dtype=torch.float64)
-    found = weigh(tile, background)
+    _, together, _ = weigh(tile, background)
     reach = float(tile.color.max())
     for pixel in range(16):
         weights = (tile.alpha * tile.light)[tile.drawn[:, pixel], pixel].sort().values.tolist()
@@ -90,7 +82,7 @@ def test_together_are_as_many_as_the_bound_allows(seed):
         while most < len(weights) and spent + reach * weights[most] <= HALF_LEVEL:
             spent += reach * weights[most]
             most += 1
-        assert int(found.together[:, pixel].sum()) == most
+        assert int(together[:, pixel].sum()) == most
 
 
 def test_alone_is_what_pictures_without_one_gaussian_show():
@@ -100,7 +92,7 @@ def test_alone_is_what_pictures_without_one_gaussian_show():
     inputs = RasterInputs(view, splats)
     idle = Idle()
     for tile in fragments(inputs, None):
-        idle.add(weigh(tile, view.background))
+        idle.add(tile, view.background)
     whole = engine.rasterize(replace(inputs, counts=True), None)
     expected = unclear = 0
     nothing = torch.full_like(splats.opacities, 1e-6)

@@ -60,13 +60,14 @@ class Idle:
     reasons: Tensor = field(default_factory=lambda: torch.zeros(2, 4, dtype=torch.int64))
     """(2, 4) all, and those idle together, by ``REASONS``."""
 
-    def add(self, tile: Weighed) -> None:
-        """Count the fragments of a tile."""
+    def add(self, tile: Any, background: Tensor) -> None:
+        """Weigh and count the fragments of a tile."""
+        alone, together, reasons = weigh(tile, background)
         self.pixels += tile.drawn.shape[1]
-        self.alone += int(tile.alone.sum())
-        self.weight += float(tile.weights[tile.together].sum())
-        for at, chosen in enumerate((tile.drawn, tile.together)):
-            self.reasons[at] += tile.reasons[chosen].bincount(minlength=len(REASONS)).cpu()
+        self.alone += int(alone.sum())
+        self.weight += float(tile.weights[together].sum())
+        for at, chosen in enumerate((tile.drawn, together)):
+            self.reasons[at] += reasons[chosen].bincount(minlength=len(REASONS)).cpu()
 
     def as_dict(self) -> dict[str, Any]:
         """Shares, as plain values."""
@@ -86,21 +87,11 @@ class Idle:
         }
 
 
-@dataclass(frozen=True)
-class Weighed:
-    """K Gaussians at the P pixels of a tile; all (K, P)."""
+def weigh(tile: Any, background: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Judge the fragments of a tile, of 1 Gaussian or more, before a background (3,).
 
-    __repr__ = one_line
-
-    drawn: Tensor  # whether there is a fragment
-    weights: Tensor  # T alpha
-    alone: Tensor  # whether it is idle
-    together: Tensor
-    reasons: Tensor  # index into ``REASONS``
-
-
-def weigh(tile: Any, background: Tensor) -> Weighed:
-    """Judge a tile's K fragments, 1 or more, front to back, before a background (3,)."""
+    All (K, P): which are idle alone; which are together; for each the index into ``REASONS``.
+    """
     alpha, light, drawn = tile.alpha, tile.light, tile.drawn
     weights = alpha * light
     left = light[-1] * (1 - alpha[-1])
@@ -122,7 +113,7 @@ def weigh(tile: Any, background: Tensor) -> Weighed:
     reasons[(opacity < FAINT).expand_as(reasons)] = 2
     reasons[alpha < RIM * opacity] = 1
     reasons[light < DARK] = 0
-    return Weighed(drawn, weights, drawn & (moved < HALF_LEVEL), together, reasons)
+    return drawn & (moved < HALF_LEVEL), together, reasons
 
 
 @dataclass(frozen=True)
@@ -213,7 +204,7 @@ class _Survey:
         inputs = self._itself.inputs(view)
         for tile in fragments(inputs, self._itself.thresholds(inputs), tiles):
             if len(tile.rows):
-                self._idle.add(weigh(tile, view.background))
+                self._idle.add(tile, view.background)
             yield
 
     def figures(self, frames: Sequence[dict[str, Any]]) -> dict[str, Any]:
