@@ -83,8 +83,9 @@ def _check_script(fork: Fork, script: str) -> None:
     if copied := re.search(rf"\bdeepcopy\(({owners})\)", text_of(tree)):
         refuse(f"copies its model, {copied[0]}", "the one that it makes")
     if size := _size(fork.repo, script):
-        found = f"draws pictures of another size than the camera's, {size}"
-        refuse(found, "the camera's: stage 2 would begin with the first of its sizes again")
+        # a resumed training may begin with the first of its sizes again
+        fork.one_run = f"{script} draws pictures of sizes that may change, {size}"
+        fork.warn("script", script, f"the size of its pictures in stage 2, {size}")
     if several := _trainings(fork, reading.module_of(script)):
         refuse(*several)
     if until := _rests(tree):

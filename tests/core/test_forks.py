@@ -586,13 +586,20 @@ NOT_RESUMED = {
         "    gaussians = GaussianModel(3)\n",
         "    for k in range(opt.models):\n        models[k] = GaussianModel(3)\n",
     ),
+    "pictures of sizes that change": (
+        ("chosen=None", "chosen=None, size=None"),
+        ("image_height=0", "image_height=size[0] if size else 0"),
+        ("pipe, background)", "pipe, background, size=photograph.shape[1:])"),
+    ),
 }
 
 
 @pytest.mark.parametrize("what", NOT_RESUMED)
 def test_stage_two_follows_in_one_run_where_a_script_cannot_resume(tmp_path, what):
     saves = ("--start_checkpoint", "--save_iterations")
-    repo, adapter = fork(tmp_path, NOT_RESUMED[what], saves), ForkAdapter()
+    changes = NOT_RESUMED[what]
+    several = (changes,) if isinstance(changes[0], str) else changes
+    repo, adapter = fork(tmp_path, *several, saves), ForkAdapter()
     assert errors(repo) == []
     line = adapter.command_line(repo)
     assert line.one_run
@@ -812,15 +819,6 @@ REFUSED_TOGETHER = [
         {"values": "image, radii, more"},
         [(KEYS, f"    image = image + more\n{KEYS}")],
         "more, read in gaussian_renderer",
-    ),
-    (
-        {},
-        [
-            ("chosen=None", "chosen=None, size=None"),
-            ("image_height=0", "image_height=size[0] if size else 0"),
-            ("pipe, background)", "pipe, background, size=photograph.shape[1:])"),
-        ],
-        "another size than the camera's, size=photograph.shape[1:]",
     ),
     (
         {},
