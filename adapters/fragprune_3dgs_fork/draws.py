@@ -30,6 +30,7 @@ NEUTRAL = {"antialiasing", "confidence", "projmatrix_raw"}
 """Further settings that the engines know, or that are checked to be neutral at every call."""
 HANDED = ("detach", "clone", "contiguous", "squeeze", "unsqueeze")
 """Methods of a value that nobody reads yet: it is handed on in another shape."""
+_EMPTY = re.compile(r"torch\.(empty|zeros)\(0[,)]")
 _PROVABLE = re.compile(r"^(?!.*(median|max|normal|var|dist)).*(depth|alpha|acc|opac)")
 """Names of values that a proof can tell, if they are what they are called."""
 
@@ -110,13 +111,16 @@ def _check_call(fork: Fork, at: str, function: str, call: graphdeco.CallInSource
     fork.screens |= screens
     given = call.arguments - rasterizer.SERVED - screens - {blended}
     further = [*(call.besides - NEUTRAL), *given]
-    unknown = {each for each in further if not _stays_off(fork, function, call.given.get(each))}
+    body = fork.repo.function(RENDERER, function)
+    unknown = {each for each in further if not _stays_off(fork, body, call.given.get(each))}
     fork.off |= {*further} - unknown
     for name in sorted(unknown & call.besides):
         changed = rasterizer.changed_gradients(fork.repo, call.package, name)
         if rasterizer.only_asks(fork.repo, call.package, name):
             unknown.remove(name)
             fork.asking |= {name}
+        elif rasterizer.rests(fork.repo, call.package, name, fork.off):
+            unknown.remove(name)
         elif changed is not None and changed <= {"means2D"}:
             unknown.remove(name)
             fork.scaled |= {name}
@@ -126,20 +130,35 @@ def _check_call(fork: Fork, at: str, function: str, call: graphdeco.CallInSource
         fork.refuse("rasterizer-call", at, found, "settings and arguments whose effect is known")
 
 
-def _stays_off(fork: Fork, function: str, value: ast.expr | None) -> bool:
-    """Whether a value is None or False unless a user asks for more; every call is checked."""
-    body = fork.repo.function(RENDERER, function)
+def _stays_off(fork: Fork, scope: ast.AST | None, value: ast.expr | None) -> bool:
+    """Whether a value in a drawing function or a script is None, False or empty unless a user asks
+    for more; every call is checked.
+    """
     if isinstance(value, ast.Attribute):
         return reading.off_in(fork.repo, (MODEL, *fork.command), value.attr)
-    if not isinstance(value, ast.Name) or body is None:
-        return is_off(value)
-    names = fork.repo.parameters(RENDERER, function) or ()
-    if value.id not in off_by_default(body):
-        return False
-    calls = [node for tree in fork.trees.values() for node in every(tree, ast.Call)]
-    own = [getattr(each.func, "id", "") == function for each in calls]
-    given = [syntax.passed(each, names if by else ()) for each, by in zip(calls, own, strict=True)]
-    return all(_stays_off(fork, "", each.get(value.id, ast.Constant(None))) for each in given)
+    if not isinstance(value, ast.Name):
+        return is_off(value) or bool(_EMPTY.match(text_of(value)))
+    if not isinstance(scope, ast.FunctionDef):
+        return _made_off(fork, scope, value.id, set())
+    if value.id not in (off := off_by_default(scope)):
+        named = [each for each in every(scope, ast.Name) if each.id in off]
+        unasked = {each.id for each in named if _stays_off(fork, scope, each)}
+        return _made_off(fork, scope, value.id, unasked)
+    calls = [(tree, each) for tree in fork.trees.values() for each in every(tree, ast.Call)]
+    names = {True: fork.repo.parameters(RENDERER, scope.name) or (), False: ()}
+    given = ((t, syntax.passed(c, names[text_of(c.func) == scope.name])) for t, c in calls)
+    return all(_stays_off(fork, t, each.get(value.id, ast.Constant(None))) for t, each in given)
+
+
+def _made_off(fork: Fork, scope: ast.AST | None, name: str, unasked: set[str]) -> bool:
+    """Likewise for what code calls by a name, without arguments that nobody gives."""
+    gone = syntax.skipped(scope, lambda node: [None] if getattr(node, "id", "") in unasked else [])
+    targets = [n for n in every(scope, ast.Name) if n.id == name and isinstance(n.ctx, ast.Store)]
+    made = {to: value for to, value in assigned(scope) if to in targets}
+    fork.options |= frozenset().union(*(fork.optional.get(each, ()) for each in made))
+    kept = [made[to] for to in made if to not in gone and to not in fork.optional]
+    known = len(made) == len(targets) and not any(isinstance(each, ast.Name) for each in kept)
+    return bool(kept) and known and all(_stays_off(fork, scope, each) for each in kept)
 
 
 def read_outputs(fork: Fork) -> None:

@@ -10,7 +10,7 @@ from functools import cached_property, lru_cache
 
 import fragprune_graphdeco as graphdeco
 from fragprune_3dgs_fork.rasterizer import Output
-from fragprune_graphdeco import assigned, every, reading, syntax, text_of
+from fragprune_graphdeco import assigned, every, failing, reading, syntax, text_of
 from fragprune_plugins.adapting import Finding, Function, HostRepo, nodes
 
 MODEL, CLASS, RENDERER = reading.MODEL, "GaussianModel", "gaussian_renderer"
@@ -123,10 +123,12 @@ class Fork:
         own = (tree for name, tree in self.trees.items() if name.split(".")[0] != "arguments")
         pairs = (pair for each in own for pair in assigned(each))
         made = _SET | {to.attr for to, _ in pairs if isinstance(to, ast.Attribute)}
-        known = reading.as_options(self.repo, self.command)
         for tree in self.trees.values():
+            once = failing.bindings(tree)
+            called = {n: v for to, v in assigned(tree) if once[n := getattr(to, "id", "")] == 1}
+            known = reading.as_options(self.repo, self.command, called)
             skipped = syntax.skipped(tree, known)
-            named = {each: reading.options_of(each, known) for each in {*skipped.values()}}
+            named = {each: reading.options_of(each, known, called) for each in {*skipped.values()}}
             under = {node: named[test] for node, test in skipped.items()}
             found |= {node: names for node, names in under.items() if made.isdisjoint(names)}
         return found

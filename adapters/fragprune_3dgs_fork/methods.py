@@ -143,7 +143,9 @@ def read_changes(fork: Fork) -> None:
             elif isinstance(node, ast.Call) and text_of(node.func).endswith("optimizer.step"):
                 name = text_of(node.func).removesuffix(".step")
                 owner = name.rpartition(".")[0]
-                if len(node.args) == 1:  # two are those of a sparse Adam
+                if optional := fork.optional.get(node):
+                    fork.options |= optional
+                elif len(node.args) == 1:  # two are those of a sparse Adam
                     found = f"another optimizer, {text_of(node)[:60]}"
                     fork.refuse("optimizer", at, found, "step()")
                 if _MODELS.search(owner) or owner.split("[")[0] in {"", *owners}:

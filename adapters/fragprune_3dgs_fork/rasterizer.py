@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal
@@ -43,6 +44,8 @@ _RAY = ("ray={(pixf.x-cx)/focal_x,(pixf.y-cy)/focal_y};", "float(width*0.5),floa
 """Of the pixel, through a camera whose axis is the picture's middle."""
 _ADDED = re.compile(r"([{;])atomicAdd\(&\(?(\w+)\[collected_id\[j\]\]\)?,(alpha\*T|1\.?0?)\);")
 """A sum for each Gaussian over its fragments, in a statement of its own."""
+_BLOCK = r"\{(?:[^{}]|" * 4 + r"\{[^{}]*\}" + r")*\}" * 4
+"""Code between braces, with further ones inside."""
 _DRAWN = re.compile(r"if\(test_T<0\.0001\)\{done=true;continue;\}")
 """Behind it, a fragment is one that is drawn."""
 
@@ -184,12 +187,29 @@ def only_asks(repo: HostRepo, package: str, setting: str) -> bool:
     made = "".join(blocks)
     targets = set(re.findall(r"(\w+)(?:\[[^]=]*\])?[-+*/]?=(?!=)", made)) - _sums(made)
     more = re.search(r"\b(atomic|continue|return|break)|trap\(", made)
-    handed = re.sub(rf"(?<=[,(])(?<!if\(){setting}(?=[,)])", "", text)
     return (
         all(re.match(r"out_(?!color)|int", each) for each in targets)
         and bool(blocks and not more)
-        and not re.search(rf"(?<!\w){setting}\b", handed)
+        and _handed_on(text, setting)
     )
+
+
+def rests(repo: HostRepo, package: str, setting: str, off: Collection[str]) -> bool:
+    """Whether kernels read a setting in blocks alone that need one of those that are off."""
+    text = "".join(kernels.normal_sources(repo, package))
+    given = rf"\b({'|'.join(sorted(off)) or '-'})!=nullptr"
+    blocks = re.finditer(rf"if\((\w+!=nullptr&&)*{given}(&&\w+!=nullptr)*\){_BLOCK}", text)
+    reading = [each[0] for each in blocks if re.search(rf"\b{setting}\b", each[0])]
+    others = text + kernels.backward_sources(repo, package)
+    for each in reading:
+        others = others.replace(each, "")
+    return bool(reading) and _handed_on(others, setting)
+
+
+def _handed_on(text: str, setting: str) -> bool:
+    """Whether sources name a setting only where functions take it and hand it on."""
+    handed = re.sub(rf"(?<=[,(])(?<!if\(){setting}(?=[,)])", "", text)
+    return not re.search(rf"(?<!\w){setting}\b", handed)
 
 
 def changed_gradients(repo: HostRepo, package: str, setting: str) -> frozenset[str] | None:

@@ -224,6 +224,10 @@ def _not_resumed(repo: HostRepo, script: str, tree: ast.Module) -> Iterator[str]
         yield "its checkpoints have no state of an optimizer"
     if uneven := reading.uneven(capture, methods["restore"]):
         yield uneven
+    for call, name in method_calls(methods["restore"]):
+        own = methods.get(name) if text_of(call.func) == f"self.{name}" else None
+        if why := failing.misfit(own, call, of_model=True):
+            yield f"its restore calls {name}, and {why}"
     whole = re.findall(r"self\.(\w+)(?=[,)])", text_of(capture))
     trained = re.findall(r"self\.(\w+)\.parameters\(", text_of(repo.tree(MODEL)))
     if networks := sorted({*whole} & {*trained}):

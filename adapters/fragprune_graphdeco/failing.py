@@ -165,7 +165,7 @@ def _misfits(repo: HostRepo, module: str) -> tuple[str, ...]:
         if name in ("capture", "restore"):
             continue
         of, *others = called.get(owner, {""}) if owner else {name}
-        if others or not (owner or _bindings(tree)[name] == 1):
+        if others or not (owner or bindings(tree)[name] == 1):
             of = ""  # a name of several things
         at = repo.at(module, node.lineno)
         home, found = definition_of(repo, MODEL if of == "GaussianModel" else module, of)
@@ -177,7 +177,7 @@ def _misfits(repo: HostRepo, module: str) -> tuple[str, ...]:
             lacks = isinstance(model, ast.ClassDef) and not (found or model.bases or inherits)
             if lacks and of == "GaussianModel":
                 misfits += (f"calls {name}, which its model lacks ({at})",)
-        if why := _misfit(found, node, bool(owner)):
+        if why := misfit(found, node, bool(owner)):
             misfits += (f"its call of {name} {why}, which fails ({at})",)
         taken, given = unpacked.get(node), _lengths(repo, home, model, found)
         if taken and given and not every(taken, ast.Starred) and len(taken.elts) not in given:
@@ -339,7 +339,7 @@ def _key(node: ast.AST) -> str:
 
 
 @lru_cache(maxsize=64)
-def _bindings(tree: ast.AST | None) -> Counter[str]:
+def bindings(tree: ast.AST | None) -> Counter[str]:
     """How often a module gives something a name."""
     return Counter(_named(nodes(tree)))
 
@@ -353,7 +353,7 @@ def _named(parts: Iterable[ast.AST]) -> Iterator[str]:
             yield from {each.split(".")[0] for each in names if isinstance(each, str)}
 
 
-def _misfit(called: ast.AST | None, call: ast.Call, of_model: bool) -> str:
+def misfit(called: ast.AST | None, call: ast.Call, of_model: bool) -> str:
     """How a call's values differ from those that a function, a method or a class takes; "" if they
     do not, or if that cannot be told.
     """

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from fragprune_graphdeco.syntax import (
@@ -179,14 +180,30 @@ def definition_of(
     return "", None
 
 
-def as_options(repo: HostRepo, modules: Collection[str]) -> Known:
-    """The values that modules give options by default."""
-    return lambda node: by_default_of(repo, modules, option) if (option := _option(node)) else []
+Named = Mapping[str, ast.expr]
+"""What code calls by a name."""
 
 
-def options_of(test: ast.expr, known: Known) -> frozenset[str]:
+def as_options(
+    repo: HostRepo, modules: Collection[str], named: Named = MappingProxyType({})
+) -> Known:
+    """The values that modules give options by default, and with them what is called by a name."""
+
+    def known(node: ast.AST) -> list[Any]:
+        return by_default_of(repo, modules, option) if (option := _option(node)) else []
+
+    def also(node: ast.AST) -> list[Any]:
+        value = named.get(getattr(node, "id", ""))
+        taken = decided(value, known) if value else None
+        return known(node) if taken is None else [taken]
+
+    return also
+
+
+def options_of(test: ast.expr, known: Known, named: Named = MappingProxyType({})) -> frozenset[str]:
     """The options that decide a test: those that are off by default, or else all."""
-    values = {_option(each): known(each) for each in nodes(test) if _option(each)}
+    parts = [test, *(named.get(each.id) for each in every(test, ast.Name))]
+    values = {_option(n): known(n) for each in parts for n in nodes(each) if _option(n)}
     off = [name for name, value in values.items() if value and not value[0]]
     return frozenset(off or (name for name, value in values.items() if value))
 

@@ -568,6 +568,7 @@ NOT_RESUMED = {
     "a lost state": ("self.optimizer.state_dict()", "None"),
     "a network beside": (SETUP, SETUP + ADAM),
     "a network of other weights": (SETUP, f"{SETUP}    net.load_state_dict(weights)\n{ADAM}"),
+    "a call that fails": ("setup(training_args)", "setup(training_args, 1)"),
     "a lost network": ('"params": [self.poses]', '"params": self.net.parameters()'),
     "a whole network": ('"params": [self.poses]', '"params": self.poses.parameters()'),
     "an import in its first iterations": (
@@ -900,6 +901,7 @@ def test_a_call_that_may_not_be_reached_or_not_fail_is_no_failure(tmp_path, what
 ASKS = "\n        if {}:\n            {}\n        loss.backward()"
 CHANGES = {
     "a change": CLAMPS,
+    "a step of its own": "gaussians.optimizer.step(seen)",
     "a result": "kept = gaussians.thin_out(mask)",
     "another step": "loss.backward()",
     "another training": "refine(gaussians)",
@@ -915,6 +917,8 @@ TESTS = {
     "asked for in another way": ('getattr(opt, "late", 0.0)', "", True),
     "on": ("opt.end > 0", "", False),
     "of the model": ("gaussians.grown", "", False),
+    "off by a name": ("thins", "\nthins = opt.late > 0 and HAS_IT\n", True),
+    "by a name of two values": ("thins", "\nthins = opt.late > 0\nthins = 1\n", False),
     "set by a run": ("opt.start_checkpoint", "", False),
     "set by the script": ("opt.late > 0", "\nopt.late = 1\n", False),
     "set from a file": ("opt.late > 0", "\nsetattr(opt, name, value)\n", False),
@@ -940,6 +944,43 @@ def test_what_an_option_changes_is_not_changed_without_it(tmp_path, test, what):
     for words in (["--late", "1"], ["--late=1"], ["--late"], ["--lat", "1"], ["--lat=1"]):
         with pytest.raises(UsageError, match="--late"):
             run([str(tmp_path / "train.py"), *words], RunOptions(device="cpu"))
+
+
+NEAR = """if (near_map != nullptr && far_map != nullptr) {
+    if (near_map[id] > 0) { if (p_view.z < near_map[id] - slack) return; }
+}"""
+GIVES_NEAR = "\n        chosen = None\n        if {}:\n            chosen = maps_of(view)\n"
+DRAWN_NEAR = (
+    "    s = Gauss",
+    "    near = torch.empty(0, device=here)\n    if maps is not None:\n        near = load(maps)\n"
+    "    s = Gauss",
+)
+NEARBY = {
+    "an option": (NEAR, "opt.maps", True),
+    "a switch that is on": (NEAR, "opt.end", False),
+    "another part of the kernel": (f"{NEAR} if (slack) return;", "opt.maps", False),
+    "the other map alone": (NEAR.replace("near_map != nullptr && ", ""), "opt.maps", False),
+}
+
+
+@pytest.mark.parametrize("what", NEARBY)
+def test_a_setting_may_rest_where_another_is_empty(tmp_path, what):
+    kernel, asked, served = NEARBY[what]
+    repo = fork(
+        tmp_path,
+        ("chosen=None):", "chosen=None, maps=None):"),
+        DRAWN_NEAR,
+        ("        package = render(", f"{GIVES_NEAR.format(asked)}        package = render("),
+        ("pipe, background)", "pipe, background, maps=chosen)"),
+        (PARSES, f"{MORE_FLAGS}parser.add_argument('--maps', default=None)\n{PARSES}"),
+        settings=", near_map=near, slack=1.0",
+        kernel=kernel,
+    )
+    assert (errors(repo) == []) == served
+    if served:
+        assert read_fork(repo).off == {"near_map"}
+        with pytest.raises(UsageError, match="--maps"):
+            ForkAdapter().refuse(repo, ["--maps", "here"], stage="auto", device="cuda")
 
 
 BEGINNINGS = {
