@@ -275,7 +275,6 @@ class ForkAdapter(GraphdecoAdapter):
             "What reading cannot prove is named by fragprune check.",
             "Stage 2 starts from a checkpoint, not from a PLY. Where a script cannot resume its "
             "own training, stage 2 follows in the same run.",
-            "New Gaussians have neutral thresholds, not their parents'.",
         ),
     )
     dialect_type = ForkDialect

@@ -2,7 +2,6 @@
 
 adapter       the base of their adapters: seams, names, files
 call          the rasterizer's call in their source
-densifying    the rows that their densify methods copy
 proof         proves their rasterizers: it draws by both, and ``likeness`` compares
 stand_ins     modules of ours for their compiled packages
 
@@ -25,10 +24,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from fragprune_graphdeco.adapter import CLONE as CLONE
 from fragprune_graphdeco.adapter import MODEL as MODEL
 from fragprune_graphdeco.adapter import SCREEN as SCREEN
-from fragprune_graphdeco.adapter import SPLIT as SPLIT
 from fragprune_graphdeco.adapter import GraphdecoAdapter as GraphdecoAdapter
 from fragprune_graphdeco.adapter import GraphdecoDialect as GraphdecoDialect
 from fragprune_graphdeco.adapter import default as default
@@ -42,10 +39,6 @@ from fragprune_graphdeco.call import CallInSource as CallInSource
 from fragprune_graphdeco.call import RasterizerCall as RasterizerCall
 from fragprune_graphdeco.call import drawing_functions as drawing_functions
 from fragprune_graphdeco.call import read_calls as read_calls
-from fragprune_graphdeco.densifying import clones as clones
-from fragprune_graphdeco.densifying import needy as needy
-from fragprune_graphdeco.densifying import reaches as reaches
-from fragprune_graphdeco.densifying import splits as splits
 from fragprune_graphdeco.drawing import Drawing as Drawing
 from fragprune_graphdeco.drawing import arguments as arguments
 from fragprune_graphdeco.kernels import SURFEL as SURFEL

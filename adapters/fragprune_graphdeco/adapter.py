@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from fragprune_graphdeco import failing, photographs, reading
 from fragprune_graphdeco.call import CallInSource, RasterizerCall, drawing_functions, read_calls
-from fragprune_graphdeco.densifying import clones, splits
 from fragprune_graphdeco.drawing import Drawing, pictures
 from fragprune_graphdeco.kernels import SPLAT, Kernel, read_kernels, vendored
 from fragprune_graphdeco.reading import mentions, module_of
@@ -84,16 +83,10 @@ def rasterizer_seam(package: str, method: str = "forward") -> Seam:
     return Seam(Role.RASTERIZE, package, f"GaussianRasterizer.{method}", needs, external=True)
 
 
-_GIVEN = ("grads", "grad_threshold", "scene_extent")
-CLONE = model_seam(Role.PARENTS, "densify_and_clone", *_GIVEN, how=clones)
-SPLIT = model_seam(Role.PARENTS, "densify_and_split", *_GIVEN, "N", how=splits)
-
 MODEL_SEAMS: tuple[Seam, ...] = (
     Seam(Role.SCENE, "scene", "Scene.__init__", ("args", "gaussians")),
     model_seam(Role.ATTACH, "training_setup", "training_args", how=optimizers),
     model_seam(Role.STEP, "update_learning_rate", "iteration"),
-    CLONE,
-    SPLIT,
     model_seam(Role.KEEP, "_prune_optimizer", "mask"),
     model_seam(Role.APPEND, "cat_tensors_to_optimizer", "tensors_dict"),
     model_seam(Role.STILL, "densify_and_prune"),

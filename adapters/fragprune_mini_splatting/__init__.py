@@ -68,16 +68,6 @@ class MiniSplattingDialect(GraphdecoDialect):
         return {**super().modules(draw), SCORING: scoring}
 
 
-def masked(call: SeamCall) -> Tensor:
-    """The parents of the masked split, which also takes the rows under the mask."""
-    mask = call.arguments["mask"].bool()
-    chosen = mask.new_zeros(len(call.model.get_xyz))
-    chosen[: len(mask)] = mask
-    chosen[graphdeco.splits(call, copies=1)] = True
-    rows: Tensor = chosen.nonzero()[:, 0]
-    return rows.repeat(call.arguments["N"])
-
-
 def packed(call: SeamCall) -> tuple[Path, Tensor] | None:
     """The Gaussians that ms_c compresses: one for each voxel, sorted by position."""
     import torch
@@ -114,9 +104,6 @@ class MiniSplatting(GraphdecoAdapter):
         Seam(Role.VIEW, RENDERER, "render_depth", ("viewpoint_camera", "pc")),
         graphdeco.rasterizer_seam(SCORING),
         graphdeco.rasterizer_seam(SCORING, "render_depth"),
-        model_seam(
-            Role.PARENTS, "densify_and_split_mask", *graphdeco.SPLIT.needs, "mask", how=masked
-        ),
         model_seam(Role.STILL, "densify_and_prune_split"),
         model_seam(Role.STILL, "prune_points", "mask"),
         model_seam(Role.STILL, "reinitial_pts", "pts", "rgb"),

@@ -9,14 +9,12 @@ opacity. Densification also follows the absolute gradients on the screen.
 from __future__ import annotations
 
 from argparse import ArgumentParser
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import fragprune_graphdeco as graphdeco
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall, model_seam
-from fragprune_plugins.adapting import HostCall, HostInfo, HostRepo, RasterInputs, Role, revised
+from fragprune_plugins.adapting import HostCall, HostInfo, HostRepo, RasterInputs, Role
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -41,16 +39,6 @@ class MipDialect(GraphdecoDialect):
         )
 
 
-ABSOLUTE = ("grads_abs", "grad_abs_threshold")  # besides vanilla's gradients
-
-
-def either(arguments: Mapping[str, Any], rows: int, flat: Callable[..., Tensor]) -> Tensor:
-    """(rows,) bool: rows where either gradient exceeds its own threshold."""
-    absolute = flat(arguments["grads_abs"], dim=-1)
-    enough = graphdeco.reaches(absolute, arguments["grad_abs_threshold"], rows)
-    return graphdeco.needy(arguments, rows, flat) | enough
-
-
 class MipSplatting(GraphdecoAdapter):
     """The adapter of Mip-Splatting."""
 
@@ -70,22 +58,7 @@ class MipSplatting(GraphdecoAdapter):
     dialect_type = MipDialect
     filtered = True
     undrawn_flags = (*GraphdecoAdapter.undrawn_flags, "--load_allres")
-    seams = (
-        *revised(
-            GraphdecoAdapter.seams,
-            {
-                seam.attribute: {
-                    "needs": (*seam.needs, *ABSOLUTE),
-                    "how": partial(parents, needy=either),
-                }
-                for seam, parents in (
-                    (graphdeco.CLONE, graphdeco.clones),
-                    (graphdeco.SPLIT, graphdeco.splits),
-                )
-            },
-        ),
-        model_seam(Role.SAVE, "save_fused_ply", "path"),
-    )
+    seams = (*GraphdecoAdapter.seams, model_seam(Role.SAVE, "save_fused_ply", "path"))
 
     def opacities(self, model: Any) -> Tensor:
         """(N,) as they are drawn: dimmed by the 3D filter."""

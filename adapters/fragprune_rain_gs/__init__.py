@@ -10,22 +10,16 @@ from __future__ import annotations
 from argparse import ArgumentParser
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from fragprune_graphdeco import SPLIT, GraphdecoAdapter, GraphdecoDialect, RasterizerCall, splits
+from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.adapting import (
     HostCall,
     HostInfo,
     HostRepo,
     Photographs,
     RasterInputs,
-    SeamCall,
     revised,
 )
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
 
 PACKAGE = "submodules.diff_gaussian_rasterization.diff_gaussian_rasterization"
 """Inside the checkout, and compiled when it is imported."""
@@ -53,13 +47,6 @@ class RainDialect(GraphdecoDialect):
         return replace(super().unpack(call), dilation=float(call.settings.low_pass))
 
 
-def far_splits(call: SeamCall) -> Tensor:
-    """The parents of a far split: N - 1 copies of each row, then N children."""
-    children = call.arguments["N"]
-    far = call.arguments["abe_split"]
-    return splits(call, copies=2 * children - 1 if far else children)
-
-
 class RainGS(GraphdecoAdapter):
     """The adapter of RAIN-GS."""
 
@@ -77,13 +64,7 @@ class RainGS(GraphdecoAdapter):
     dialect_type = RainDialect
     steps_by_rendering = True
     flags = {"white_background": ("--white_bg",), "hold_out": ()}  # it always holds views out
-    seams = revised(
-        GraphdecoAdapter.seams,
-        {
-            "GaussianRasterizer.forward": {"module": PACKAGE},
-            SPLIT.attribute: {"needs": (*SPLIT.needs, "abe_split"), "how": far_splits},
-        },
-    )
+    seams = revised(GraphdecoAdapter.seams, {"GaussianRasterizer.forward": {"module": PACKAGE}})
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
         """The command without its modes, which cannot resume.

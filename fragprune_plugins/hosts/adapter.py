@@ -41,7 +41,7 @@ class ParamGroup:
     Attributes:
         name: the host's name for it.
         colour: holds the colour, which ``--train appearance`` trains beside the opacity.
-        copied: children copy it from their parents bit for bit; this is checked.
+        copied: children copy it from their parents bit for bit, by which their parents are known.
         scheduled: the host sets its learning rate in every iteration, also in stage 2.
         named: the host's source spells the name out; otherwise the adapter's ``group_name`` does.
     """

@@ -47,12 +47,8 @@ class Role(Enum):
         "answer a call that the host's own function cannot answer on this machine",
         "instead: the result",
     )
-    PARENTS = (
-        "find the parents of the rows about to be appended",
-        "before: rows (n,) int64 that will be copied, one per row appended, in order",
-    )
     KEEP = "keep the surviving rows"
-    APPEND = "append rows"
+    APPEND = "append rows, with the thresholds of those whose copies they are"
     REARRANGE = (
         "keep, copy and append rows in one call; does nothing in stage 2",
         "around: a context manager that makes the host's own code carry row numbers; it "
@@ -83,9 +79,7 @@ class Role(Enum):
         self.does, self.how = does, how
 
 
-NEEDS_HOW = frozenset(
-    {Role.ATTACH, Role.PARENTS, Role.REARRANGE, Role.PACK, Role.UNPACK, Role.ANSWER}
-)
+NEEDS_HOW = frozenset({Role.ATTACH, Role.REARRANGE, Role.PACK, Role.UNPACK, Role.ANSWER})
 """Roles whose seams need a ``how`` from the adapter."""
 
 

@@ -5,57 +5,42 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from torch import Tensor
 
-from fragprune_plugins.errors import AlignmentError
 from fragprune_plugins.hosts.seams import SeamCall
 from fragprune_plugins.injection.state import SessionState
 
 
-def on_parents(session: SessionState, call: SeamCall) -> Any:
-    """Note the parents before the host copies them."""
-    state = session.models.get(call.model)
-    if state is None:
-        return call.run()
-    state.pending_parents = call.how()
-    try:
-        result = call.run()
-        if state.pending_parents is not None:
-            left = len(state.pending_parents)
-            expect_children(call, f"{left} selected parents without a child", not left)
-        return result
-    finally:
-        state.pending_parents = None
-
-
 def on_append(session: SessionState, call: SeamCall) -> Any:
-    """Append thresholds for new rows: those of their parents, whose copies they are, or neutral."""
+    """Append thresholds for new rows: those of the rows whose copies they are, or neutral ones."""
     state = session.models.get(call.model)
     if state is None:
         return call.run()
-    tensors = call.first
-    count, parents = len(next(iter(tensors.values()))), state.pending_parents
-    if parents is not None:
-        parents, rest = parents[:count], parents[count:]
-        state.pending_parents = rest if len(rest) else None  # parents of the next append
-        known = {name: group["params"][0] for name, group in session.groups(call.model)}
-        copied = [group.name for group in session.adapter.groups if group.copied]
-        copies = len(parents) == count and all(
-            torch.equal(tensors[name], known[name][parents]) for name in copied
-        )
-        what = f"{count} new rows that are not copies of the selected parents"
-        expect_children(call, what, copies)
+    new = call.first
+    copied = [group.name for group in session.adapter.groups if group.copied and group.name in new]
+    parents = None
+    if copied and not state.store.neutral:
+        own = {name: group["params"][0] for name, group in session.groups(call.model)}
+        parents = copies(*([rows[name] for name in copied] for rows in (own, new)))
     result = call.run()
     with session.changing(state.store, "append"):
-        state.store.append(count, parents)
+        state.store.append(len(next(iter(new.values()))), parents)
     return result
 
 
-def expect_children(call: SeamCall, found: str, right: bool) -> None:
-    """Raise AlignmentError unless new rows are ``right``, one child per parent and repeat."""
-    if not right:
-        expected = "one child per selected parent and repeat, in the host's order"
-        remedy = "Report this with the host's commit: its densification differs."
-        raise AlignmentError(str(call.seam), found, expected, remedy)
+def copies(known: list[Tensor], new: list[Tensor]) -> Tensor:
+    """(M,) int64 for each new row the last of those that have its values bit for bit, -1 for none.
+
+    A row is the values at its place in all tensors, (N, ...) of those that are known, (M, ...) of
+    the new ones. Hosts' densification does not say which rows it copied.
+    """
+    tables = [torch.cat([each.detach().flatten(1) for each in rows], 1) for rows in (known, new)]
+    bits = torch.cat(tables).float().view(torch.int32)
+    kinds: Tensor = torch.unique(bits, dim=0, return_inverse=True)[1]
+    last = kinds.new_full((len(bits),), -1)
+    numbers = torch.arange(len(known[0]), device=last.device)
+    last.scatter_reduce_(0, kinds[: len(numbers)], numbers, "amax")
+    return last[kinds[len(numbers) :]]
 
 
 def on_keep(session: SessionState, call: SeamCall) -> Any:

@@ -36,7 +36,6 @@ OF_CALLS: dict[Role, Callable[[SessionState, SeamCall], Any]] = {
 OF_MODELS: dict[Role, Callable[[SessionState, SeamCall], Any]] = {
     Role.ATTACH: stepping.on_attach,
     Role.STEP: stepping.on_step,
-    Role.PARENTS: aligning.on_parents,
     Role.KEEP: aligning.on_keep,
     Role.APPEND: aligning.on_append,
     Role.REARRANGE: aligning.on_rearrange,

@@ -43,7 +43,6 @@ class ModelState:
     stage: Stage2 | None = None  # None if thresholds of a sidecar only apply
     steps: int = 0  # the host's, since the session saw the model
     begun: bool = False  # a step has begun, and its loss has not gone backward
-    pending_parents: Tensor | None = None  # (P,) int64 rows that the host is about to copy
     prepared: bool = False  # by the adapter, for stage 2
     views: dict[Hashable, Callable[[], Any]] = field(default_factory=dict)  # each draws it again
     newest: Any = None  # the call whose Gaussians these draw

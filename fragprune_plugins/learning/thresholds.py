@@ -247,13 +247,12 @@ class ThresholdStore:
 
         Args:
             parents: (count,) int64, the rows whose thresholds the new ones inherit; neutral when
-                None. Moments of new rows are zero, as the hosts' are.
+                None, and where -1. Moments of new rows are zero, as the hosts' are.
         """
-        if parents is None:
-            new = torch.full((count,), NEUTRAL_LOGIT, device=self.logits.device)
-        else:
-            parents = self._rows(parents, count, "append")
-            new = self.logits.detach()[parents]
+        new = torch.full((count,), NEUTRAL_LOGIT, device=self.logits.device)
+        if parents is not None:
+            parents = self._rows(parents, count, "append", least=-1)
+            new[parents >= 0] = self.logits.detach()[parents[parents >= 0]]
         self._resize(lambda rows: torch.cat([rows, rows.new_zeros(count)]))
         with torch.no_grad():
             self.logits[len(self) - count :] = new
@@ -331,12 +330,12 @@ class ThresholdStore:
         if given is not None:
             self._given = self._note(change(given))
 
-    def _rows(self, rows: Tensor, count: int, operation: str) -> Tensor:
+    def _rows(self, rows: Tensor, count: int, operation: str, least: int = 0) -> Tensor:
         rows = torch.as_tensor(rows, dtype=torch.int64, device=self.logits.device)
-        inside = rows.ndim == 1 and bool(((rows >= 0) & (rows < len(self))).all())
+        inside = rows.ndim == 1 and bool(((rows >= least) & (rows < len(self))).all())
         if not inside or len(rows) != count:
             found = f"{len(rows)} row indices for {count} rows"
-            expected = f"{count} indices in [0, {len(self)})"
+            expected = f"{count} indices in [{least}, {len(self)})"
             why = "Report this with the host's name: its rows changed in a way the adapter misread."
             raise AlignmentError(f"ThresholdStore.{operation}", found, expected, why)
         return rows

@@ -24,7 +24,6 @@ MODEL = "scene/gaussian_model.py"
         ("mcmc", "utils/reloc_utils.py", "compute_relocation", "another", "compute_rel"),
         ("mip-splatting", RENDERER, "subpixel_offset=", "offset=", "kernel_size, offset"),
         ("mip-splatting", MODEL, "compute_3D_filter", "compute", "no compute_3D_filter"),
-        ("mip-splatting", MODEL, "grads_abs", "absolute", "absolute"),
         ("mip-splatting", RENDERER, "means2D=", "view2gaussian=0, means2D=", "view2gauss"),
         ("rain-gs", RENDERER, "low_pass=low_pass,\n", "", "takes what hosts share"),
         ("rain-gs", MODEL, "divide_ratio", "ratio", "no divide_ratio"),

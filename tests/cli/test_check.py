@@ -54,7 +54,7 @@ def test_the_host_that_fits_with_every_seam_in_its_place(host):
             name = seam["seam"].split(":")[1].split(".")[-1]
             assert f"def {name}(" in (host / file).read_text().splitlines()[int(line) - 1]
     text = succeeds("check", host, "--adapter", "vanilla-3dgs")
-    assert f"{MODEL}:{line_of(host, MODEL, 'def densify_and_split')}" in text.stdout
+    assert f"{MODEL}:{line_of(host, MODEL, 'def _prune_optimizer')}" in text.stdout
     assert f"fragprune run -- python {host / 'train.py'}" in text.stdout
     alone = succeeds("check", host).stdout
     assert alone.splitlines()[4].startswith("vanilla-3dgs fits: ")
@@ -98,11 +98,11 @@ def test_nothing_is_imported(host, python):
 
 
 def test_one_that_fits_none_has_the_whole_reason_of_each_of_the_nearest(host):
-    mutations.rename_function(HostRepo(host), CLONE)
+    mutations.rename_function(HostRepo(host), KEEP)
     lines = [line for line in run("check", host).stdout.splitlines() if "does not fit" in line]
     assert lines[0].startswith("3dgs-fork does not fit: ")
     assert len(lines) == 3
-    why = "14 of 15 seams hold; no GaussianModel.densify_and_clone"
+    why = "12 of 13 seams hold; no GaussianModel._prune_optimizer"
     assert lines[1].startswith(f"vanilla-3dgs does not fit: {why}")
     assert not any(line.endswith("...") for line in lines)
 
@@ -118,18 +118,18 @@ def test_packages_that_it_imports_and_that_are_not_here_are_listed(host):
     assert "".join(f"  {way}\n" for way in ways) in run("check", host).stdout
 
 
-CLONE = Seam(Role.STILL, "scene.gaussian_model", "GaussianModel.densify_and_clone")
+KEEP = Seam(Role.KEEP, "scene.gaussian_model", "GaussianModel._prune_optimizer")
 
 
 def test_a_dropped_parameter_is_named_where_the_method_is(host):
-    line = line_of(host, MODEL, "def densify_and_clone(")
-    mutations.rename_parameter(HostRepo(host), CLONE, "scene_extent")
+    line = line_of(host, MODEL, "def _prune_optimizer(")
+    mutations.rename_parameter(HostRepo(host), KEEP, "mask")
     report = of(refused(host))
     (error,) = [f for f in report["findings"] if f["level"] == "error"]
-    assert (error["code"], error["where"]) == ("seam-signature", f"{CLONE} ({MODEL}:{line})")
-    assert error["expected"] == "also scene_extent"
+    assert (error["code"], error["where"]) == ("seam-signature", f"{KEEP} ({MODEL}:{line})")
+    assert error["expected"] == "also mask"
     text = run("check", host, "--adapter", "vanilla-3dgs").stdout
-    assert f"CHANGED at {MODEL}:{line}: parameters (grads, " in text
+    assert f"CHANGED at {MODEL}:{line}: parameters (" in text
 
 
 def test_an_ancestor_of_the_host_steps_back_and_says_so(tmp_path, monkeypatch):
@@ -142,7 +142,7 @@ def test_an_ancestor_of_the_host_steps_back_and_says_so(tmp_path, monkeypatch):
     assert run_json("check", tmp_path)["fits"] == "fork"
     said = run("check", tmp_path).stdout
     assert "fork fits" in said
-    assert "vanilla-3dgs fits: 15 of 15 seams hold; fork descends from it" in said
+    assert "vanilla-3dgs fits: 13 of 13 seams hold; fork descends from it" in said
     assert "Use: fragprune run" in said
 
 

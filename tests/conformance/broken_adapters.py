@@ -39,15 +39,9 @@ class TakesRandomNumbers(Vanilla3DGS):
         return super().means(model)
 
 
-class MixesUpParents(Vanilla3DGS):
-    """Gives children the thresholds of others, and says they are right."""
+class LosesParents(Vanilla3DGS):
+    """Names no group by which the parents of children are known."""
 
-    seams = tuple(
-        replace(seam, how=lambda call, how=seam.how: how(call).flip(0))
-        if seam.role is Role.PARENTS
-        else seam
-        for seam in Vanilla3DGS.seams
-    )
     groups = tuple(replace(group, copied=False) for group in Vanilla3DGS.groups)
 
 

@@ -39,9 +39,6 @@ class TestFork(RelativeConformance):
     adapter = "3dgs-fork"
     host = HOSTS["3dgs-fork"]
 
-    def test_alignment(self, case: object) -> None:
-        pytest.skip(f"{NOT_APPLICABLE}a row that is added begins neutral, whatever its parent has")
-
     def test_refuse(self, case: object) -> None:
         pytest.skip(f"{NOT_APPLICABLE}it reads signatures: what it refuses, core/test_forks says")
 

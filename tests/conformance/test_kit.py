@@ -32,7 +32,7 @@ def case(adapter, **options):
     [
         (invariants.nothing_stays, broken.PatchesByHand, "could not be restored"),
         (invariants.neutral_is_the_host, broken.TakesRandomNumbers, "differ from the host's own"),
-        (invariants.alignment, broken.MixesUpParents, "descends from"),
+        (invariants.alignment, broken.LosesParents, "descends from"),
         (invariants.monotone, broken.LeavesATrace, "not close"),
         (invariants.monotone, broken.ForgetsTheBackground, "the background is off by 0.9"),
         (invariants.monotone, broken.GivesNoRadii, "no Gaussian has a radius"),

@@ -8,6 +8,7 @@ from core.sessions import Model, Role, call, follow, state
 
 from fragprune_plugins.adapting import AlignmentError, RowTrace
 from fragprune_plugins.injection.session import OF_MODELS
+from fragprune_plugins.learning.thresholds import NEUTRAL_LOGIT
 
 LOGITS = -3 + torch.arange(6.0) / 8
 
@@ -25,47 +26,38 @@ def told(session):
     ]
 
 
-def append(session, model, rows, expected="appended"):
-    """The host appends rows of the model by their numbers."""
-    tensors = {name: each[rows].clone() for name, each in model.rows().items()}
+MOVED = {
+    "copies, two of one row": ((4, 1, 5, 1), {}, (4, 1, 5, 1)),
+    "one that is no copy": ((4, 1, 5), {"xyz": 1}, (4, None, 5)),
+    "two that are no copies": ((4, 1, 5), {"xyz": 0, "o": 2}, (None, 1, None)),
+    "none": ((), {}, ()),
+}
+
+
+@pytest.mark.parametrize("what", MOVED)
+def test_new_rows_get_the_thresholds_of_those_whose_copies_they_are(session, what):
+    model, known = follow(session)
+    rows, moved, expected = MOVED[what]
+    tensors = {name: each.detach()[list(rows)].clone() for name, each in model.rows().items()}
+    for name, row in moved.items():
+        tensors[name][row] += 1
     seam = call(model, Role.APPEND, lambda tensors: "appended", tensors)
-    assert OF_MODELS[Role.APPEND](session, seam) == expected
+    assert OF_MODELS[Role.APPEND](session, seam) == "appended"
+    inherited = [NEUTRAL_LOGIT if each is None else float(LOGITS[each]) for each in expected]
+    assert torch.equal(known.store.logits, torch.tensor([*LOGITS, *inherited]))
 
 
-def parents(session, model, rows, body):
-    """Inside a call that chooses parents, ``body`` runs."""
-    seam = call(model, Role.PARENTS, lambda: body() or "chosen", how=lambda _: rows)
-    return OF_MODELS[Role.PARENTS](session, seam)
-
-
-def test_a_parent_without_a_child_is_refused_with_their_number(session):
+def test_of_equal_rows_the_last_is_the_parent(session):
     model, known = follow(session)
-    rows = torch.tensor([4, 1, 5])
-    with pytest.raises(AlignmentError, match="host:f: 2 selected parents without a child"):
-        parents(session, model, rows, lambda: append(session, model, rows[:1]))
-    assert known.pending_parents is None
+    with torch.no_grad():
+        for each in model.rows().values():
+            each[4] = each[1]
+    tensors = {name: each.detach()[[1]] for name, each in model.rows().items()}
+    OF_MODELS[Role.APPEND](session, call(model, Role.APPEND, lambda tensors: None, tensors))
+    assert known.store.logits[6] == LOGITS[4]
 
 
-@pytest.mark.parametrize(
-    ("rows", "moved"),
-    [([4, 2, 5], ()), ([4, 1, 5, 3], ()), ([4, 1, 5], ["xyz"]), ([4, 1, 5], ["o"])],
-)
-def test_what_is_no_copy_of_its_parent_is_refused_before_the_host_appends(session, rows, moved):
-    model, known = follow(session)
-    appended = []
-
-    def body():
-        tensors = {name: each[rows] + (name in moved) for name, each in model.rows().items()}
-        OF_MODELS[Role.APPEND](session, call(model, Role.APPEND, appended.append, tensors))
-
-    with pytest.raises(AlignmentError, match=f"{len(rows)} new rows that are not copies"):
-        parents(session, model, torch.tensor([4, 1, 5]), body)
-    assert appended == []
-    assert len(known.store) == 6
-    assert known.pending_parents is None
-
-
-@pytest.mark.parametrize("role", [Role.PARENTS, Role.KEEP, Role.APPEND, Role.REARRANGE, Role.STILL])
+@pytest.mark.parametrize("role", [Role.KEEP, Role.APPEND, Role.REARRANGE, Role.STILL])
 def test_a_model_that_is_not_followed_is_the_hosts_own_business(session, role):
     seam = call(Model(3), role, lambda tensors: f"done with {tensors}", "these")
     assert OF_MODELS[role](session, seam) == "done with these"

@@ -61,9 +61,9 @@ def apply(store: ThresholdStore, shadow: Shadow, operation: str, argument) -> No
         store.keep(torch.tensor(mask, dtype=torch.bool))
         shadow.rows = [row for row, kept in zip(shadow.rows, mask, strict=True) if kept]
     elif operation == "append" and n:
-        parents = [i % n for i in argument]
+        parents = [i % (n + 1) - 1 for i in argument]
         store.append(len(parents), torch.tensor(parents, dtype=torch.int64))
-        shadow.rows += [[shadow.rows[i][0], 0.0, 0.0] for i in parents]
+        shadow.rows += [[-30.0 if i < 0 else shadow.rows[i][0], 0.0, 0.0] for i in parents]
     elif operation == "orphans":
         store.append(argument)
         shadow.rows += [[-30.0, 0.0, 0.0] for _ in range(argument)]
@@ -235,7 +235,7 @@ def test_state_dict_is_a_copy():
         ("indices as mask", lambda s: s.keep(torch.tensor([0, 1, 2]))),
         ("column mask", lambda s: s.keep(torch.ones(3, 1, dtype=torch.bool))),
         ("parent beyond the end", lambda s: s.append(1, torch.tensor([3]))),
-        ("negative parent", lambda s: s.append(1, torch.tensor([-1]))),
+        ("negative parent", lambda s: s.append(1, torch.tensor([-2]))),
         ("too few parents", lambda s: s.append(2, torch.tensor([0]))),
         ("origin beyond the end", lambda s: s.rearrange(torch.tensor([9]), NEW)),
         ("fewer origins than rows", lambda s: s.rearrange(torch.tensor([], dtype=int), NEW)),
