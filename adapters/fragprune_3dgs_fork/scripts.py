@@ -173,22 +173,13 @@ def _bound_at_first(tree: ast.Module) -> tuple[str, str] | None:
     """A name that a function binds only in its first iterations, and where; it reads it later."""
     for function in every(tree, ast.FunctionDef):
         early = under(function, r"(^|and )iteration (<|<=|==) \d+$")
-        bound = [(name, node) for node in nodes(function) for name in _binds(node)]
+        bound = [(name, node) for node in nodes(function) for name in failing.named([node])]
         first = {name: early[node] for name, node in bound if node in early}
         later = {name for name, node in bound if node not in early}
         for read in every(function, ast.Name):
             if read.id in first.keys() - later and read not in early:
                 return read.id, first[read.id]
     return None
-
-
-def _binds(node: ast.AST) -> list[str]:
-    """Names that a node of a function binds."""
-    if isinstance(node, ast.Import | ast.ImportFrom):
-        return [(each.asname or each.name).split(".")[0] for each in node.names]
-    if isinstance(node, ast.arg):
-        return [node.arg]
-    return [node.id] if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) else []
 
 
 def _not_resumed(repo: HostRepo, script: str, tree: ast.Module) -> Iterator[str]:

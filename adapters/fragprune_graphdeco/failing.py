@@ -231,7 +231,7 @@ def _unbound(repo: HostRepo, module: str) -> Iterator[str]:
     outside = [each for each in nodes(tree) if each not in inside or isinstance(each, ast.Global)]
     for part in learning(tree):
         around = (node for each in functions if part in each for node in each)
-        bound = {*_named([*outside, *around]), *dir(builtins), "__file__"}
+        bound = {*named([*outside, *around]), *dir(builtins), "__file__"}
         for name in (each for each in every(part, ast.Name) if each not in gone):
             if name.id not in bound and "*" not in bound:
                 yield f"reads {name.id}, which nothing defines ({repo.at(module, name.lineno)})"
@@ -341,10 +341,10 @@ def _key(node: ast.AST) -> str:
 @lru_cache(maxsize=64)
 def bindings(tree: ast.AST | None) -> Counter[str]:
     """How often a module gives something a name."""
-    return Counter(_named(nodes(tree)))
+    return Counter(named(nodes(tree)))
 
 
-def _named(parts: Iterable[ast.AST]) -> Iterator[str]:
+def named(parts: Iterable[ast.AST]) -> Iterator[str]:
     """The names that code gives, of each part."""
     for node in parts:
         if isinstance(getattr(node, "ctx", ast.Store()), ast.Store):

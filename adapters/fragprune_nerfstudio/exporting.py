@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.adapting import AlignmentError
+from fragprune_plugins.learning.thresholds import copies
 
 COLUMNS = {
     "means": ("x", "y", "z"),
@@ -51,20 +52,12 @@ def rows_among(known: Mapping[str, Tensor], chosen: Mapping[str, Tensor], where:
 
     Rows that are equal in every value are selected together. AlignmentError if it is no selection.
     """
-    ours, theirs = _bits(known), _bits({name: chosen[name] for name in known})
-    _, which = np.unique(np.concatenate([ours, theirs]), return_inverse=True)
-    ours, theirs = which[: len(ours)], which[len(ours) :]
-    rows = np.flatnonzero(np.isin(ours, theirs))
-    if not np.array_equal(ours[rows], theirs):
+    tables = [[each[name].cpu() for name in known] for each in (known, chosen)]
+    ours, theirs = (copies(tables[0], each) for each in tables)
+    rows = torch.isin(ours, theirs).nonzero()[:, 0]
+    if not torch.equal(ours[rows], theirs):
         found = f"{len(theirs)} Gaussians, of which {len(rows)} are the model's in its order"
         expected = f"a selection of the model's {len(ours)} Gaussians"
         remedy = "Report this with nerfstudio's version: it selects in another way."
         raise AlignmentError(where, found, expected, remedy)
-    return torch.from_numpy(rows)
-
-
-def _bits(values: Mapping[str, Tensor]) -> np.ndarray[Any, Any]:
-    """(N,) one value of raw bytes for each row."""
-    parts = [each.cpu().numpy().astype(np.float32) for each in values.values()]
-    table = np.ascontiguousarray(np.concatenate(parts, axis=1))
-    return table.view(np.dtype((np.void, table.shape[1] * table.itemsize))).reshape(-1)
+    return rows

@@ -114,8 +114,6 @@ class Seam:
 
 
 _signatures: WeakKeyDictionary[Callable[..., Any], Signature] = WeakKeyDictionary()
-_signatures_of_methods: WeakKeyDictionary[Callable[..., Any], Signature] = WeakKeyDictionary()
-"""By function; a bound method's lacks the instance."""
 
 
 @dataclass
@@ -147,14 +145,13 @@ class SeamCall:
     def _signature(self) -> Signature:
         """The function's, read once: a view is drawn in a few times as long as it takes."""
         plain = getattr(self.function, "__func__", self.function)
-        known = _signatures if plain is self.function else _signatures_of_methods
         try:
-            found = known.get(plain)
+            found = _signatures.get(plain) or _signatures.setdefault(plain, signature(plain))
         except TypeError:  # functions of C take no weak reference
             return signature(self.function)
-        if found is None:
-            found = known[plain] = signature(self.function)
-        return found
+        if plain is self.function:
+            return found
+        return found.replace(parameters=[*found.parameters.values()][1:])  # a method's instance
 
     @property
     def first(self) -> Any:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
-from torch import Tensor
-
 from fragprune_plugins.hosts.seams import SeamCall
 from fragprune_plugins.injection.state import SessionState
+from fragprune_plugins.learning.thresholds import copies
 
 
 def on_append(session: SessionState, call: SeamCall) -> Any:
@@ -26,21 +24,6 @@ def on_append(session: SessionState, call: SeamCall) -> Any:
     with session.changing(state.store, "append"):
         state.store.append(len(next(iter(new.values()))), parents)
     return result
-
-
-def copies(known: list[Tensor], new: list[Tensor]) -> Tensor:
-    """(M,) int64 for each new row the last of those that have its values bit for bit, -1 for none.
-
-    A row is the values at its place in all tensors, (N, ...) of those that are known, (M, ...) of
-    the new ones. Hosts' densification does not say which rows it copied.
-    """
-    tables = [torch.cat([each.detach().flatten(1) for each in rows], 1) for rows in (known, new)]
-    bits = torch.cat(tables).float().view(torch.int32)
-    kinds: Tensor = torch.unique(bits, dim=0, return_inverse=True)[1]
-    last = kinds.new_full((len(bits),), -1)
-    numbers = torch.arange(len(known[0]), device=last.device)
-    last.scatter_reduce_(0, kinds[: len(numbers)], numbers, "amax")
-    return last[kinds[len(numbers) :]]
 
 
 def on_keep(session: SessionState, call: SeamCall) -> Any:

@@ -17,7 +17,7 @@ from fragprune_plugins.files.atomic import staging
 from fragprune_plugins.hosts.adapter import CHECKPOINT_KEY, optimizer_state
 from fragprune_plugins.hosts.seams import SeamCall
 from fragprune_plugins.injection.state import ModelState, SessionState
-from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.learning.thresholds import ThresholdStore, copies
 
 
 def on_save(session: SessionState, call: SeamCall) -> Any:
@@ -190,12 +190,9 @@ def restore_rates(session: SessionState, model: Any) -> None:
 
 def rows_of(means: Tensor, among: Tensor, where: str) -> Tensor:
     """(M,) int64: for each mean (M, 3), the first row of ``among`` (N, 3) with the same bits."""
-    known, wanted = among.detach().cpu().numpy(), means.numpy()
-    both = np.concatenate([known, wanted])
-    _, first, which = np.unique(both, axis=0, return_index=True, return_inverse=True)
-    rows = first[which.reshape(-1)[len(known) :]]
-    if lost := int((rows >= len(known)).sum()):
-        found = f"{lost} of {len(wanted)} positions without a Gaussian"
+    rows = copies([among.cpu()], [means])
+    if lost := int((rows < 0).sum()):
+        found = f"{lost} of {len(rows)} positions without a Gaussian"
         remedy = "Report this with the host's commit: it packs another model."
-        raise AlignmentError(where, found, f"positions of the {len(known)} Gaussians", remedy)
-    return torch.from_numpy(rows)
+        raise AlignmentError(where, found, f"positions of the {len(among)} Gaussians", remedy)
+    return rows

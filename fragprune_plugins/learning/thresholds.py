@@ -6,7 +6,7 @@ what hosts do to theirs, moments included.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import torch
@@ -350,3 +350,18 @@ class ThresholdStore:
 def _misfit(found: str, expected: str) -> SidecarError:
     """The error of a state that no store can have had."""
     return SidecarError("threshold state", found, expected, "Use a sidecar written by fragprune.")
+
+
+def copies(known: Sequence[Tensor], new: Sequence[Tensor]) -> Tensor:
+    """(M,) int64 for each new row the first that has its values bit for bit, -1 for none.
+
+    A row is the values at its place in all tensors, (N, ...) of those that are known, (M, ...) of
+    the new ones.
+    """
+    tables = [torch.cat([each.detach().flatten(1) for each in rows], 1) for rows in (known, new)]
+    bits = torch.cat(tables).float().view(torch.int32)
+    kinds: Tensor = torch.unique(bits, dim=0, return_inverse=True)[1]
+    first = kinds.new_full((len(bits),), -1)
+    numbers = torch.arange(len(known[0]), device=first.device)
+    first.scatter_reduce_(0, kinds[: len(numbers)], numbers, "amin", include_self=False)
+    return first[kinds[len(numbers) :]]

@@ -47,14 +47,14 @@ def test_new_rows_get_the_thresholds_of_those_whose_copies_they_are(session, wha
     assert torch.equal(known.store.logits, torch.tensor([*LOGITS, *inherited]))
 
 
-def test_of_equal_rows_the_last_is_the_parent(session):
+def test_of_equal_rows_the_first_is_the_parent(session):
     model, known = follow(session)
     with torch.no_grad():
         for each in model.rows().values():
             each[4] = each[1]
     tensors = {name: each.detach()[[1]] for name, each in model.rows().items()}
     OF_MODELS[Role.APPEND](session, call(model, Role.APPEND, lambda tensors: None, tensors))
-    assert known.store.logits[6] == LOGITS[4]
+    assert known.store.logits[6] == LOGITS[1]
 
 
 @pytest.mark.parametrize("role", [Role.KEEP, Role.APPEND, Role.REARRANGE, Role.STILL])
