@@ -9,13 +9,14 @@ a proof     Prover, Proof, Place
 its script  CommandLine, ConfigFile, Photographs, Resolution
 files       UntrustedFile, for those that a host reads; replacing, for those that we write;
             Model, read_ply, thresholds_of
+numbers     copies, which rows others are copies of; rotations of quaternions
 settings    parse_goal
 a plugin    hookimpl
 errors      each with where, found, expected and remedy
 
 Every name here is imported as itself: that is how Python says that a module passes it on.
-Importing this module imports no torch. Model, read_ply and thresholds_of load it when they are
-first used: import them inside functions, or under TYPE_CHECKING.
+Importing this module imports no torch. Model, read_ply, thresholds_of, copies and rotations load it
+when they are first used: import them inside functions, or under TYPE_CHECKING.
 
 What descendants of the 3DGS code of 2023 share is in ``fragprune_graphdeco``.
 """
@@ -79,11 +80,16 @@ if TYPE_CHECKING:
     from fragprune_plugins.files.model import Model as Model
     from fragprune_plugins.files.ply import read_ply as read_ply
     from fragprune_plugins.files.sidecar import thresholds_of as thresholds_of
+    from fragprune_plugins.learning.area import rotations as rotations
+    from fragprune_plugins.learning.thresholds import copies as copies
 
-_LATE = {"Model": "model", "read_ply": "ply", "thresholds_of": "sidecar"}
+_LATE = {
+    **{"Model": "files.model", "read_ply": "files.ply", "thresholds_of": "files.sidecar"},
+    **{"copies": "learning.thresholds", "rotations": "learning.area"},
+}
 
 
 def __getattr__(name: str) -> Any:
     if name not in _LATE:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"fragprune_plugins.files.{_LATE[name]}"), name)
+    return getattr(import_module(f"fragprune_plugins.{_LATE[name]}"), name)

@@ -42,23 +42,16 @@ def most_compressed(call: SeamCall) -> Path:
 
 @contextmanager
 def tracing(call: SeamCall) -> Iterator[RowTrace]:
-    """Store row numbers as a second column of the opacities, which sorting only moves.
-
-    The column holds the bits of integers, so every row number is exact.
-    """
+    """Find the rows again that sorting moves: it changes no value."""
     import torch
 
+    from fragprune_plugins.adapting import copies
+
     model, trace = call.model, RowTrace()
-    opacity = model._opacity.detach()
-    numbers = torch.arange(len(opacity), dtype=torch.int32, device=opacity.device)
-    rider = numbers.view(torch.float32)[:, None]
-    model._opacity = torch.nn.Parameter(torch.cat([opacity, rider], dim=1))
-    try:
-        yield trace
-    finally:
-        opacity, rider = (part.contiguous() for part in model._opacity.detach().split(1, 1))
-        model._opacity = torch.nn.Parameter(opacity)
-    trace.origins = rider[:, 0].view(torch.int32).long()
+    names = ("_xyz", "_opacity", "_scaling", "_rotation")
+    before = [getattr(model, name).detach().clone() for name in names]
+    yield trace
+    trace.origins = copies(before, [getattr(model, name) for name in names])
     trace.fresh = torch.zeros_like(trace.origins, dtype=torch.bool)
 
 

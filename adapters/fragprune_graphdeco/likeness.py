@@ -17,6 +17,7 @@ from fragprune_plugins.adapting import (
     RasterOutputs,
     Splats,
     View,
+    rotations,
 )
 
 SHARE: Final = 200
@@ -174,10 +175,8 @@ def _normals(seen: Seen, *signs: int) -> Tensor | None:
     splats, view = seen.splats, seen.inputs.view
     if splats is None or splats.scales is None or splats.rotations is None:
         return None
-    w, *axis = torch.nn.functional.normalize(splats.rotations, dim=1).T
-    turn, unit = torch.stack(axis, 1), torch.eye(3).to(w)[splats.scales.argmin(1)]
-    cross = torch.linalg.cross(turn, unit)
-    normals = unit + 2 * (w[:, None] * cross + torch.linalg.cross(turn, cross))
+    axes = rotations(torch.nn.functional.normalize(splats.rotations, dim=1)).mT
+    normals = axes[torch.arange(len(axes), device=axes.device), splats.scales.argmin(1)]
     away = (normals * (splats.means - view.campos)).sum(1, keepdim=True) > 0
     normals = torch.where(away, -normals, normals)
     if signs:

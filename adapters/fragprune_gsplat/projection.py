@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from fragprune_plugins.adapting import ALPHA_MIN
+from fragprune_plugins.adapting import ALPHA_MIN, rotations
 
 TILE = 16
 EXTENT, SQUARE = 3.33, 3.0  # in sigma: since 1.5 per axis, until 1.4 along the longer one
@@ -67,13 +67,7 @@ def product(a: Tensor, b: Tensor) -> Tensor:
 
 def covariances(quats: Tensor, scales: Tensor) -> Tensor:
     """(N, 3, 3) from quaternions (N, 4) w, x, y, z of any length and activated scales (N, 3)."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
-    rows = (
-        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], dim=-1),
-        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], dim=-1),
-        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], dim=-1),
-    )
-    root = torch.stack(rows, dim=-2) * scales[:, None]
+    root = rotations(torch.nn.functional.normalize(quats, dim=-1)) * scales[:, None]
     return product(root, root.transpose(-1, -2))
 
 

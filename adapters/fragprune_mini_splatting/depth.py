@@ -13,7 +13,14 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from fragprune_plugins.adapting import InputError, RasterInputs, RasterOutputs, Splats, View
+from fragprune_plugins.adapting import (
+    InputError,
+    RasterInputs,
+    RasterOutputs,
+    Splats,
+    View,
+    rotations,
+)
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -52,7 +59,8 @@ def render_depth(
     winners, left, image = drawn.winners, 1 - drawn.alpha[0], drawn.image
     assert winners is not None  # scores were asked for
     directions = _directions(inputs.view)
-    whiten = _whiten(splats.scales.double(), splats.rotations.double())
+    # the world to a frame where the ellipsoid at three scales is the unit sphere
+    whiten = rotations(splats.rotations.double()).mT / (3 * splats.scales.double()[:, :, None])
     offset = inputs.view.campos.double() - splats.means.double()  # (N, 3) from the mean to the eye
     start = (whiten @ offset[:, :, None])[:, :, 0]
     normals = (whiten.transpose(1, 2) @ start[:, :, None])[:, :, 0]
@@ -92,17 +100,6 @@ def _directions(view: View) -> Tensor:
     rows, columns = torch.meshgrid(y * view.tan_fov_y, x * view.tan_fov_x, indexing="ij")
     camera = torch.stack([columns, rows, torch.ones_like(rows)], dim=-1)
     return camera @ turn
-
-
-def _whiten(scales: Tensor, rotations: Tensor) -> Tensor:
-    """(N, 3, 3): world to a frame where the ellipsoid at three scales is the unit sphere."""
-    w, x, y, z = rotations.unbind(-1)
-    columns = [
-        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], dim=-1),
-        torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], dim=-1),
-        torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], dim=-1),
-    ]
-    return torch.stack(columns, dim=-2) / (3 * scales[:, :, None])
 
 
 def _behind(

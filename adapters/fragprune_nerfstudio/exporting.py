@@ -9,8 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fragprune_plugins.adapting import AlignmentError
-from fragprune_plugins.learning.thresholds import copies
+from fragprune_plugins.adapting import AlignmentError, copies
 
 COLUMNS = {
     "means": ("x", "y", "z"),

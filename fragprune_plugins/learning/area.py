@@ -90,7 +90,7 @@ def project(
         assert splats.scales is not None
         assert splats.rotations is not None
         lengths = inputs.scale_modifier * splats.scales
-        columns = _rotations(splats.rotations)
+        columns = rotations(splats.rotations)
         a = lengths * (across[:, :, None] * columns).sum(1)
         b = lengths * (down[:, :, None] * columns).sum(1)
         xx, xy, yy = (a * a).sum(-1), (a * b).sum(-1), (b * b).sum(-1)
@@ -119,7 +119,7 @@ def _quadratic(cov3d: Tensor, one: Tensor, other: Tensor) -> Tensor:
     return torch.stack(tuple(terms)).sum(0)
 
 
-def _rotations(quaternions: Tensor) -> Tensor:
+def rotations(quaternions: Tensor) -> Tensor:
     """(N, 3, 3) from w, x, y, z (N, 4), used as given."""
     w, x, y, z = quaternions.unbind(-1)
     entries = (

@@ -146,8 +146,7 @@ KNOWN = {
         *("fragprune_plugins.injection.options", "fragprune_plugins.injection.process"),
         *("fragprune_plugins.injection.session", "fragprune_plugins.learning.events"),
         *("fragprune_plugins.learning.interruption", "fragprune_plugins.learning.stage2"),
-        *("fragprune_plugins.learning.deferred", "fragprune_plugins.learning.thresholds"),
-        "fragprune_plugins.plugins.loading",
+        *("fragprune_plugins.learning.deferred", "fragprune_plugins.plugins.loading"),
     },
 }
 
