@@ -83,21 +83,13 @@ class CallInSource(RasterizerCall):
 
 def drawing_functions(repo: HostRepo, module: str) -> list[str]:
     """Functions and methods of a module that make settings for a rasterizer, in source order."""
-    tree = repo.tree(module)
-    scopes = [("", node) for node in (tree.body if tree else ())]
+    scopes = [("", node) for node in getattr(repo.tree(module), "body", ())]
     scopes += [
         (f"{k.name}.", node) for _, k in scopes if isinstance(k, ast.ClassDef) for node in k.body
     ]
-    return [
-        f"{within}{node.name}"
-        for within, node in scopes
-        if isinstance(node, ast.FunctionDef) and _makes_settings(repo, module, node)
-    ]
-
-
-def _makes_settings(repo: HostRepo, module: str, function: Function) -> bool:
-    imported = _Imported(repo, module, function)
-    return any(imported.of(each, SETTINGS) for each in nodes(function))
+    made = [(f"{of}{n.name}", n) for of, n in scopes if isinstance(n, ast.FunctionDef)]
+    read = ((name, nodes(n), _Imported(repo, module, n)) for name, n in made)
+    return [name for name, parts, of in read if any(of.of(each, SETTINGS) for each in parts)]
 
 
 @lru_cache(maxsize=64)  # of the adapters, many ask

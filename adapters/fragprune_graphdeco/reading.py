@@ -154,11 +154,6 @@ def home_of(repo: HostRepo, module: str) -> str:
     return definition_of(repo, module, "GaussianModel")[0]
 
 
-def class_of(model: ModelClass) -> ast.stmt | None:
-    """The definition of a model's class."""
-    return definition_of(model.repo, model.module, model.name)[1]
-
-
 def owners(tree: ast.AST | None) -> set[str]:
     """Variables, and lists and dicts, that hold models which a script makes."""
     pairs = assigned(tree)

@@ -141,7 +141,7 @@ def getters(model: ModelClass) -> Iterator[tuple[str, bool]]:
         model = ModelClass(model.repo)
     always = reading.computed_getters(model, reading.unset(model))
     options = reading.options(model, reading.training_modules(model.repo))
-    home = reading.class_of(model)
+    _, home = reading.definition_of(model.repo, model.module, model.name)
     bases = [text_of(each) for each in getattr(home, "bases", ())]
     if {*bases} - {"object", "nn.Module", "torch.nn.Module"} and model.method("get_xyz"):
         for kind in (kind for kind, getter in model.getters.items() if getter is None):
