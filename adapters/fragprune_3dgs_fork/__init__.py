@@ -380,27 +380,18 @@ class ForkAdapter(GraphdecoAdapter):
         saved = map(str, sorted({first, last, *stated}))
         return [*arguments, "--iterations", str(last), "--save_iterations", *saved]
 
-    def _expect_served(self, repo: HostRepo, script: Path) -> None:
-        fork = read_fork(repo)
-        name = script.resolve().relative_to(repo.root.resolve()).as_posix()
-        if name in fork.unserved:
-            raise UsageError(
-                name,
-                fork.unserved[name],
-                f"a script that is served: {', '.join(fork.scripts)}",
-                "Prune its PLY: fragprune finetune.",
-            )
-
-    def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
-        """The same script.
+    def trainer(self, repo: HostRepo, script: Path) -> ForkAdapter:
+        """This adapter.
 
         Raises:
-            UsageError: it is not served.
+            UsageError: the script trains and is not served.
         """
-        for root in script.resolve().parents[:2]:  # the checkout, or a folder of it
-            if (repo := HostRepo(root)).tree(MODEL) is not None:
-                self._expect_served(repo, script)
-        return super().resumed_by(script, arguments)
+        fork = read_fork(repo)
+        for name, why in fork.unserved.items():
+            if script.resolve() == (repo.root / name).resolve():
+                served = f"a script that is served: {', '.join(fork.scripts)}"
+                raise UsageError(name, why, served, "Prune its PLY: fragprune finetune.")
+        return self
 
     def refuse(self, repo: HostRepo, arguments: list[str], *, stage: str, device: str) -> None:
         """Refuse trained exposures, which checkpoints of 3DGS lack, and joint learning where our
@@ -445,7 +436,6 @@ class ForkAdapter(GraphdecoAdapter):
 
     def densified(self, repo: HostRepo, script: Path, arguments: list[str]) -> int | None:
         """As 3DGS tells, if scripts change the model only until then; else unknown."""
-        self._expect_served(repo, script)
         known = rests_after_densification(read_fork(repo))
         return super().densified(repo, script, arguments) if known else None
 

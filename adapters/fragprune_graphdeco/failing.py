@@ -33,6 +33,7 @@ from fragprune_graphdeco.syntax import (
 )
 from fragprune_plugins.adapting import HostRepo, imported, nodes
 
+_RASTERIZES = "GaussianRasterizer("
 _ELSEWHERE = re.compile(r"\w+(?:\.\w+)*\.(?:scene(?:\.\w+)*|gaussian_renderer)")
 
 
@@ -49,7 +50,7 @@ def reasons(repo: HostRepo, scripts: tuple[str, ...]) -> tuple[str, ...]:
     saver = ModelClass(repo).saver
     if saver and saver.name != "save_ply" and ".save_ply(" not in text_of(saver):
         found.append(f"Scene.save writes its PLY by {saver.name}, which saves no thresholds")
-    found += [*_left_out(repo, scripts)][:1]
+    found += [*_left_out(repo, scripts), *_of_scene(repo)][:1]
     for script in scripts:
         module = module_of(script)
         tree, home = repo.tree(module), home_of(repo, module)
@@ -63,6 +64,7 @@ def reasons(repo: HostRepo, scripts: tuple[str, ...]) -> tuple[str, ...]:
         found += [*_broken(repo, module)][:1]
         found += [*_unbound(repo, module)][:1]
         found += (*_misfits(repo, module), *_absent(repo, module), *_own_options(repo, module))[:1]
+        found += [*_untyped(repo, module)][:1]
         found += [f"{script} draws by {each}" for each in _drawn_elsewhere(repo, module)][:1]
     return tuple(found)
 
@@ -102,7 +104,19 @@ def _broken(repo: HostRepo, module: str) -> Iterator[str]:
                 path = each.replace(".", "/")
                 if not ((repo.root / path).is_dir() or any(repo.root.glob(f"{path}.*"))):
                     yield f"imports {each}, which is not there ({at})"
+            if alone and isinstance(node, ast.ImportFrom):
+                for each in _lacking(repo, repo.absolute(name, node), node):
+                    yield f"imports {each} ({at})"
             waiting += [each for each in names if each not in waiting]
+
+
+def _lacking(repo: HostRepo, home: str, node: ast.ImportFrom) -> Iterator[str]:
+    """Names that a statement imports from a module of the checkout, and that this does not have."""
+    bound = bindings(repo.tree(home))
+    for name in (each.name for each in node.names if repo.tree(home)):
+        inside = repo.path(f"{home}.{name}") or (repo.root / home.replace(".", "/") / name).is_dir()
+        if not (inside or name.startswith(("_", "*")) or {name, "*", "__getattr__"} & bound.keys()):
+            yield f"{name}, which {home} lacks"
 
 
 def _left_out(repo: HostRepo, scripts: Iterable[str]) -> Iterator[str]:
@@ -130,6 +144,13 @@ def _drawn_elsewhere(repo: HostRepo, module: str) -> Iterator[str]:
     functions in it without a rasterizer of 3DGS that draw in the place of others.
     """
     usual, known = "gaussian_renderer", as_options(repo, ("arguments", module))
+    trains = learning(repo.tree(module))
+    called = {
+        each.func.id for f in trains for each in every(f, ast.Call) if hasattr(each.func, "id")
+    }
+    for each in getattr(repo.tree(module), "body", ()) if repo.tree(usual) else ():
+        if (getattr(each, "name", "") in called or each in trains) and _RASTERIZES in text_of(each):
+            yield f"{each.name} of its own, not of {usual}"
     for node in every(repo.tree(module), ast.ImportFrom):
         beside = repo.absolute(module, node)
         for body in (repo.function(usual, each.name) for each in node.names if beside == usual):
@@ -144,7 +165,7 @@ def _drawn_elsewhere(repo: HostRepo, module: str) -> Iterator[str]:
         for each in node.names if beside != usual else ():
             home, found = definition_of(repo, beside, each.name)
             own = definition_of(repo, usual, each.name)[0]
-            if own and home != own and "GaussianRasterizer(" in text_of(found):
+            if own and home != own and _RASTERIZES in text_of(found):
                 yield f"{each.name} of {home}, not of {usual}"
 
 
@@ -173,10 +194,8 @@ def _misfits(repo: HostRepo, module: str) -> tuple[str, ...]:
         if owner:
             body = model.body if isinstance(model, ast.ClassDef) else []
             found = next((each for each in body if getattr(each, "name", "") == name), None)
-            inherits = "setattr(" in texts or f".{name} = " in texts
-            lacks = isinstance(model, ast.ClassDef) and not (found or model.bases or inherits)
-            if lacks and of == "GaussianModel":
-                misfits += (f"calls {name}, which its model lacks ({at})",)
+            if of in ("GaussianModel", "Scene") and _lacks(model, name, texts):
+                misfits += (f"calls {name}, which {of} lacks ({at})",)
         if why := misfit(found, node, bool(owner)):
             misfits += (f"its call of {name} {why}, which fails ({at})",)
         taken, given = unpacked.get(node), _lengths(repo, home, model, found)
@@ -184,6 +203,27 @@ def _misfits(repo: HostRepo, module: str) -> tuple[str, ...]:
             what = f"takes {len(taken.elts)} values of {name}, which gives {min(given)}"
             misfits += (f"{what} ({at})",)
     return misfits
+
+
+def _lacks(model: ast.AST | None, name: str, texts: str) -> bool:
+    """Whether a class neither has a method, nor may inherit it, nor is given it in code."""
+    if not isinstance(model, ast.ClassDef) or model.bases:
+        return False
+    has = any(getattr(each, "name", "") == name for each in model.body)
+    return not (has or "setattr(" in texts or f".{name} = " in texts)
+
+
+def _of_scene(repo: HostRepo) -> Iterator[str]:
+    """Methods that the scene calls of the model whatever is asked for, and that the model lacks."""
+    tree, model = repo.tree("scene"), definition_of(repo, MODEL, "GaussianModel")[1]
+    texts = text_of(tree) + text_of(repo.tree(MODEL))
+    asked = [each for each in every(tree, ast.If) if "loaded_iter" not in text_of(each.test)]
+    perhaps = {inner for each in (*asked, *every(tree, ast.Try)) for inner in nodes(each)}
+    for node in (each for each in every(tree, ast.Call) if each not in perhaps):
+        owner, _, name = text_of(node.func).rpartition(".")
+        if owner == "self.gaussians" and _lacks(model, name, texts):
+            at = repo.at("scene", node.lineno)
+            yield f"its scene calls {name}, which GaussianModel lacks ({at})"
 
 
 def _lengths(
@@ -244,11 +284,8 @@ _OURS = ("source_path", "model_path", "iterations", "checkpoint_iterations", "st
 def _own_options(repo: HostRepo, module: str) -> Iterator[str]:
     """Options that a script sets whatever its command says: one of ours, or all that a file has."""
     tree = repo.tree(module)
-    body = getattr(tree, "body", ())
-    asked = [node for node in body if isinstance(node, ast.If)]
-    main = [each for node in asked if "__name__" in text_of(node.test) for each in node.body]
     known = as_options(repo, ("arguments", module))
-    for node in (*body, *main):
+    for node in _started(getattr(tree, "body", ())):
         at = repo.at(module, node.lineno)
         if isinstance(node, ast.For) and _sets_any(node, skipped(tree, known)):
             yield f"sets options by {text_of(node.iter)}, whatever its command says ({at})"
@@ -261,6 +298,31 @@ def _own_options(repo: HostRepo, module: str) -> Iterator[str]:
         made = definition_of(repo, module, called)[1]
         if isinstance(made, ast.FunctionDef) and _sets_any(made, skipped(made, known)):
             yield f"sets options by {called}, whatever its command says ({at})"
+
+
+def _untyped(repo: HostRepo, module: str) -> Iterator[str]:
+    """The length of a training, where its default is None: a group makes no type of that."""
+    for group in every(repo.tree("arguments"), ast.ClassDef):
+        made = repo.function("arguments", f"{group.name}.__init__")
+        taken = repo.parameters("arguments", f"{group.name}.__init__") or ()
+        calls = repo.calls(module, group.name)
+        for value in (value for to, value in assigned(made) if text_of(to) == "self.iterations"):
+            name = text_of(value)
+            if (
+                made
+                and name in off_by_default(made)
+                and any(name not in passed(e, taken) for e in calls)
+            ):
+                at = repo.at("arguments", value.lineno)
+                yield f"cannot take --iterations, which is None by default ({at})"
+
+
+def _started(body: Iterable[ast.stmt]) -> Iterator[ast.stmt]:
+    """The statements of a script that is started, whatever its command says."""
+    for node in body:
+        yield node
+        if isinstance(node, ast.If) and re.match("__(name|debug)__", text_of(node.test)):
+            yield from _started(node.body)
 
 
 def overruling(repo: HostRepo, module: str) -> frozenset[str]:

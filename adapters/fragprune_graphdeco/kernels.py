@@ -19,6 +19,7 @@ from fragprune_plugins.adapting import Finding, HostRepo, nodes
 _DEEPEST = 6  # folders below the checkout in which a rasterizer is looked for
 _NOT_THEIRS = {"third_party", "build", "dist", "site-packages", "node_modules", "glm", "backward"}
 _COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/", re.DOTALL)
+_CONSTANT = re.compile(r"^ *# *define\s+(\w+)\s+(\(?\d*\.[\d.f/ ]*\)?)\s*$", re.MULTILINE)
 _ALPHA = re.compile(r"\b(?:float|double|auto)\s+alpha\s*=([^;]+);")
 _BLENDS = re.compile(r"1(?:\.0?f?)?\s*-\s*alpha\b|\balpha\s*<\s*1")
 """What a blended alpha leaves of the light behind it, or when it is too faint to be blended."""
@@ -42,7 +43,7 @@ _UNLIKE = re.compile(
     r"[;{})](?:(?:alpha|power)\*=[^;]+|(alpha|power)=\1\*[^;]+);|SortPairsDescending\(|"
     r"test_T=(?!T\*\(1(?:\.0?)?-\w*alpha\);)[^;]+;|C\[ch\]\+=[^;]+\*alpha;|"
     r"out_color\[[^]]*\]=(?:C\[ch\]|[^;]*/[^;]*);|\bpower<-?[\d.]+|"
-    r"\bS\[([0-2])\]\[\2\]=(?!\w+\*scale\.[xyz];)[^;]+;|"
+    r"\bS\[([0-2])\]\[\2\]=(?!(?:\w+\*)?scale\.[xyz];)[^;]+;|"
     r"SH_C0=(?!0\.28209)[^;]+;|SH_C1=(?!0\.48860)[^;]+;|conic\.z,opacit\w+(?:\[\w+\])?\*\d[^}]*\}"
 )
 """Code that draws otherwise."""
@@ -179,10 +180,13 @@ class _Project:
 
     def __init__(self, repo: HostRepo, folder: Path, package: str) -> None:
         self.repo, self.folder, self.package = repo, folder, package
-        self.texts = {
+        texts = {
             path: _COMMENT.sub(lambda each: "\n" * each[0].count("\n"), repo.read(path))
             for path in _compiled(repo, folder)
         }
+        numbers = dict(pair for text in texts.values() for pair in _CONSTANT.findall(text))
+        named = re.compile(rf"\b({'|'.join(numbers) or '(?!)'})\b")
+        self.texts = {k: named.sub(lambda m: numbers[m[1]], each) for k, each in texts.items()}
 
     def compare(self, kernel: Kernel) -> Iterator[Finding]:
         """The differences from a rule."""

@@ -54,6 +54,7 @@ def read_plain(repo: HostRepo) -> Plain:
     flat, getters = list(saved.scales(model)), dict(saved.getters(model))
     drawn = dict([*_of_drawing(repo, _renderers(repo)), *_moved(repo, repo)])
     reasons = [
+        *saved.elements(model),
         *flat,
         *(each for each in drawn if "3D_filter" not in each),
         *getters,
@@ -188,11 +189,20 @@ def _of_scripts(model: ModelClass) -> Iterator[str]:
 
 
 def _of_sums(repo: HostRepo, script: str) -> Iterator[str]:
-    """A picture that a training script adds up of several drawings."""
+    """A picture that a training script adds up of several drawings, or puts together of them."""
     tree = repo.tree(script)
-    parts = ((to, made) for to, made in assigned(tree) if isinstance(made, ast.Subscript))
-    drawn = {text_of(to) for to, made in parts if text_of(made.slice) == "'render'"}
-    drawn |= {text_of(e) for e in every(tree, ast.Subscript) if text_of(e.slice) == "'render'"}
+    drawn = {text_of(e) for e in every(tree, ast.Subscript) if text_of(e.slice) == "'render'"}
+    pairs = [(text_of(to), made) for to, made in assigned(tree)]
+    same = {to: text for to, made in pairs if (text := text_of(_same(made))) != to}
+    for put in every(tree, ast.Assign):
+        items = [e for e in (put.targets[0], put.value) if isinstance(e, ast.Subscript)]
+        names = [text_of(each.value) for each in items]
+        of = {each if same.get(each) in drawn else same.get(each, "") for each in names}
+        if len(of) == 2 and all(same.get(each) in drawn for each in of):
+            at = repo.at(script, put.lineno)
+            yield f"its script puts a picture into another, {text_of(put)[:60]} ({at})"
+            return
+    drawn |= {to for to, made in pairs if text_of(made) in drawn}
     for node in every(tree, ast.BinOp):
         if isinstance(node.op, ast.Add):
             sides = [_terms(each) & drawn for each in (node.left, node.right)]
@@ -200,6 +210,14 @@ def _of_sums(repo: HostRepo, script: str) -> Iterator[str]:
                 at = repo.at(script, node.lineno)
                 yield f"its script adds several pictures, {text_of(node)[:60]} ({at})"
                 return
+
+
+def _same(node: ast.expr) -> ast.expr:
+    """What a value is made of by methods that keep its numbers."""
+    method = getattr(node, "func", None)
+    if isinstance(method, ast.Attribute) and method.attr in saved.SAME:
+        return _same(method.value)
+    return node
 
 
 def _terms(node: ast.expr) -> set[str]:

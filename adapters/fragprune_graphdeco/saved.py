@@ -34,6 +34,15 @@ def columns(model: ModelClass) -> tuple[Function | None, list[str]]:
     return listed, [each for each in names if each.isidentifier()]
 
 
+def elements(model: ModelClass) -> Iterator[str]:
+    """Elements of other names than the one that is read."""
+    calls = [e for e in every(model.saver, ast.Call) if text_of(e.func).endswith(".describe")]
+    texts = [arg for each in calls for arg in each.args[1:2] if not isinstance(arg, ast.Name)]
+    if texts and "'vertex'" not in map(text_of, texts):
+        at = model.repo.at(model.module, texts[0].lineno)
+        yield f"its PLY has elements {text_of(texts[0])}, no vertex ({at})"
+
+
 def scales(model: ModelClass) -> Iterator[str]:
     """Gaussians with two scales, or with one."""
     repo, module = model.repo, model.module
@@ -84,6 +93,8 @@ def _other_numbers(value: ast.expr) -> bool:
         return _other_numbers(value.value)
     if isinstance(method, ast.Attribute) and method.attr in _STORES:
         return _other_numbers(method.value)
+    if isinstance(value, ast.Call) and text_of(method).endswith("numpy"):
+        return any(map(_other_numbers, value.args))
     known = re.search(r"inverse|log|gather|np\.(zeros|ones)", text_of(method))
     return not (known or isinstance(value, ast.Name | ast.Attribute))
 

@@ -105,7 +105,9 @@ class Vanilla3DGS(GraphdecoAdapter):
             return fork.errors if trains else []
         held = (seam for seam in self.seams if seam.role is Role.STILL)
         known = {seam.attribute.rpartition(".")[2] for seam in held} | STATISTICS
-        what = [f"{name}: {fork.unserved[name]}" for name in self.scripts if name in fork.unserved]
+        trained = dict.fromkeys(fork.scripts, "another training script") | fork.unserved
+        usual = [name for name in self.scripts if name in fork.scripts]
+        what = [f"{name}: {why}" for name, why in trained.items() if name not in usual]
         what += [f"{name}, which changes the model" for name in fork.still if name not in known]
         what += [fork.one_run] if fork.one_run else []
         about, steps = ("other-host", str(repo.root)), "the steps of 3DGS alone"

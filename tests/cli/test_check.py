@@ -82,6 +82,11 @@ def test_a_script_with_other_steps_is_not_vanillas(host, old, new, found):
     assert found in str(report["differs"])
 
 
+def test_one_with_a_further_training_script_is_left_to_the_adapter_that_reads_them_all(host):
+    (host / "train_more.py").write_text((host / "train.py").read_text())
+    assert "train_more.py: another training script" in str(refused(host)["differs"])
+
+
 CHECKED = """
 import json, sys
 from click.testing import CliRunner

@@ -480,10 +480,9 @@ def test_of_several_scripts_those_are_served_that_can_be(tmp_path):
     assert errors(repo) == []
     scripts = [tmp_path / each for each in ForkAdapter().command_line(repo).scripts]
     assert [each.name for each in scripts] == ["train.py", "train_more.py"]
-    assert ForkAdapter().resumed_by(scripts[0], []) == (scripts[0], [])
-    for refused in (ForkAdapter().resumed_by, partial(ForkAdapter().densified, repo)):
-        with pytest.raises(UsageError, match="2 places"):
-            refused(scripts[1], [])
+    assert ForkAdapter().trainer(repo, scripts[0])
+    with pytest.raises(UsageError, match="2 places"):
+        ForkAdapter().trainer(repo, scripts[1])
     warned = [each.found for each in ForkAdapter().match(repo).findings if each.level == "warning"]
     assert warned[0].startswith("training/train_more.py, which is not served: 2 places")
 
@@ -495,7 +494,7 @@ def test_a_script_of_another_model_is_named_and_not_served(tmp_path):
     assert errors(repo) == []
     assert read_fork(repo).unserved == {"train_time.py": "makes GaussianModelOfTime"}
     with pytest.raises(UsageError, match="train_time"):
-        ForkAdapter().resumed_by(tmp_path / "train_time.py", [])
+        ForkAdapter().trainer(repo, tmp_path / "train_time.py")
 
 
 def test_the_camera_is_found_by_its_name(tmp_path):
@@ -623,6 +622,10 @@ OVERRULES = {
     "a folder of its own": ("args.source_path = '/data/mine'", False),
     "a folder by a name of its own": ("args.model_path = os.path.join('out', now())", False),
     "the same, whole": ("args.source_path = os.path.abspath(args.source_path)", True),
+    "a folder of its own where Python debugs": (
+        "if __debug__:\n        args.source_path = '/data/mine'",
+        False,
+    ),
     "another option": ("args.images = 'images_4'", True),
     "the length": ("args.iterations = 7000", False),
     "more to save": ("args.checkpoint_iterations = args.checkpoint_iterations + [7]", True),
@@ -782,7 +785,8 @@ REFUSED = [
     ("gaussians.oneupSHdegree()", CLAMPS, "changes _opacity outside"),
     (STEPS, f"        if iteration < 9:\n    {STEPS}", "optimizer steps only where iteration < 9"),
     ("projmatrix=0", "projmatrix=view.intrinsics", "is view.intrinsics"),
-    (STATEMENT, "gaussians.prune(mask)", "calls prune, which its model lacks (train.py:"),
+    (STATEMENT, "gaussians.prune(mask)", "calls prune, which GaussianModel lacks (train.py:"),
+    (STATEMENT, "scene.shuffle()", "calls shuffle, which Scene lacks (train.py:"),
     ("if iteration < opt", f"rows = {STATEMENT}\n        if opt", "reads what thin_out"),
     ('"name": "scaling"', '"name": "size"', "no group scaling"),
     ("(viewpoint_camera, pc,", "(viewpoint_camera, xyz,", "a camera and a model"),
@@ -1066,6 +1070,44 @@ def test_a_script_draws_by_a_function_that_has_a_seam(tmp_path, again):
     assert ("train.py draws by render of gaussian_renderer.mine" in found) == (not again)
 
 
+@pytest.mark.parametrize("used", ["paint(view, gaussians)", "log(paint)"])
+def test_a_script_that_draws_by_a_function_of_its_own_is_refused(tmp_path, used):
+    paints = (
+        "\ndef paint(view, pc):\n    return GaussianRasterizer(view)(pc.get_xyz)\n\n\ndef training("
+    )
+    trains = ("        loss.backward()", f"        loss += {used}\n        loss.backward()")
+    found = "; ".join(errors(fork(tmp_path, ("\ndef training(", paints), trains)))
+    assert ("train.py draws by paint of its own" in found) == used.startswith("paint")
+
+
+@pytest.mark.parametrize(("given", "runs"), [("", False), (", 30_000", True), (", steps=9", True)])
+def test_a_script_whose_length_has_no_type_is_refused(tmp_path, given, runs):
+    repo = fork(tmp_path, (PARSES, f"\nOptimizationParams(parser{given})\n{PARSES}"))
+    takes = "def __init__(self, parser, steps=None):\n        self.iterations = steps\n"
+    (tmp_path / "arguments").mkdir(exist_ok=True)
+    group = f"class OptimizationParams:\n    {takes}"
+    (tmp_path / "arguments/__init__.py").write_text(group)
+    assert ("cannot take --iterations" in str(errors(repo))) == (not runs)
+
+
+@pytest.mark.parametrize(
+    ("under", "called", "runs"),
+    [
+        ("if not self.loaded_iter:", "self.gaussians.create_from_mesh()", False),
+        ("if not self.loaded_iter:", "self.gaussians.training_setup(args)", True),
+        ("if args.mesh:", "self.gaussians.create_from_mesh()", True),
+        ("if True:", "self.cameras.sort()", True),
+    ],
+)
+def test_a_scene_that_calls_what_its_model_lacks_is_refused(tmp_path, under, called, runs):
+    repo = fork(tmp_path)
+    scene = tmp_path / "scene/__init__.py"
+    made = f"def __init__(self, args, gaussians):\n        {under}\n            {called}\n"
+    scene.write_text(scene.read_text().replace("def __init__(self, args, gaussians): ...\n", made))
+    found = "its scene calls create_from_mesh, which GaussianModel lacks (scene/__init__.py:7)"
+    assert errors(repo) == [] if runs else found in str(errors(repo))
+
+
 @pytest.mark.parametrize("asked", ["fast", "pipe.fast"])
 def test_a_function_without_a_rasterizer_draws_in_the_place_of_no_other(tmp_path, asked):
     quick = "    s = Gaussian", f"    if {asked}:\n        return quick(pc)\n    s = Gaussian"
@@ -1085,6 +1127,10 @@ def test_a_function_without_a_rasterizer_draws_in_the_place_of_no_other(tmp_path
         ("helpers", "def f():\n", "imports helpers, which is no valid Python (scene/tools.py:1)"),
         ("helpers", "def f(): ...\n", ""),
         ("helpers", "\ufeffdef f(): ...\n", ""),
+        ("helpers", "f = g = None\n", ""),
+        ("helpers", "from elsewhere import *\n", ""),
+        ("helpers", "def __getattr__(name): ...\n", ""),
+        ("helpers", "def g(): ...\n", "imports f, which helpers lacks (scene/tools.py:1)"),
         ("helpers", None, ""),  # an installed package
         ("train", None, "imports train, which is not there (scene/tools.py:1)"),
         ("scene.helpers", None, "imports scene.helpers, which is not there (scene/tools.py:1)"),

@@ -44,6 +44,7 @@ MODEL = """
         opacities = self._opacity.detach().cpu().numpy()
         scale = self._scaling.detach().cpu().numpy()
 """
+SAVED = "        scale = self._scaling.detach().cpu().numpy()\n"
 RENDER = """
 from diff_gaussian_rasterization import GaussianRasterizer
 
@@ -241,6 +242,12 @@ def test_the_nearest_host_is_of_this_family(fork):
         ("return torch.cat((", "return self.net((", "get_features is computed"),
         ("shs=shs, scales", "dc=shs, shs=pc.net(view), scales", "colours from pc.net"),
         ("= self._opacity.detach()", "= self.get_opacity_now.detach()", "stores other values"),
+        (
+            SAVED,
+            SAVED + "        PlyElement.describe(rows, f'vertex_{i}')\n",
+            "f'vertex_{i}', no vertex",
+        ),
+        ("= self._opacity.detach()", "= to_numpy(2 * self._opacity)", "other numbers"),
         ("means3D=means3D, ", "means=means3D, ", "no function was found that calls"),
         ('"opacity"]', '"opacity", "binding_0"]', "binding, positions relative to the triangles"),
         ('names.append("f_dc_{}".format(i))', "...", "lacks the columns f_dc"),
@@ -324,7 +331,7 @@ def test_the_nearest_host_is_of_this_family(fork):
         ("\n\ndef render", "\n\n@toned\ndef render", "render is wrapped by toned"),
         ("\n\ndef render", "\n\nrender = toned(render)\n\n\ndef render", "by toned(render)"),
         (
-            "        scale = self._scaling.detach().cpu().numpy()\n",
+            SAVED,
             "        ...\n\n\nGaussianModel.get_opacity = other\n",
             "GaussianModel.get_opacity is replaced",
         ),
@@ -351,6 +358,12 @@ def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):
         ("means3D = pc.get_xyz", "means3D = moved(viewpoint_camera.pose, pc.get_xyz)"),
         ('"opacity"]', '"opacity", "obj_dc_0"]'),
         ("= self._opacity.detach()", "= self.inverse_activation(self.get_opacity)"),
+        ("= self._opacity.detach()", "= to_numpy(self.rows['opacity'])"),
+        (
+            SAVED,
+            SAVED
+            + "        PlyElement.describe(rows, 'vertex'), PlyElement.describe(rows, 'code')\n",
+        ),
         ("        scale = self._sc", "        m = self.get_opacity > 0\n        scale = self._sc"),
         ("shs = pc.get_features", "shs = cut(pc.get_features, pc.get_max_sh_channels)"),
         ("opacity = pc.get_opacity\n", "opacity = pc.opacity_activation(pc._opacity)\n"),
@@ -519,6 +532,12 @@ def test_model_and_drawing_may_lie_in_any_package(fork, tmp_path, drawn, kind, r
         ("image = a + b * 0.5", "adds several pictures, a + b * 0.5"),
         ("loss = l1(a, photograph) + l1(b, photograph)", None),
         ("image = a + background", None),
+        ("a.permute(1, 2, 0)[mirror] = photograph[mirror]", None),
+        ("picture = a.clone()\n    picture[mirror] = a[mirror]", None),
+        (
+            "picture = a.permute(1, 2, 0)\n    picture[mirror] = b[mirror]",
+            "puts a picture into another, picture[mirror] = b[mirror]",
+        ),
     ],
 )
 def test_a_picture_of_several_models_is_not_that_of_one_ply(fork, made, reason):

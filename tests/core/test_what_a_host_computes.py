@@ -59,6 +59,23 @@ def errors(repo, adapter=Vanilla3DGS):
     return [str(f) for f in adapter().match(repo).findings if f.level == "error"]
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "fits"),
+    [
+        ("p_view.z <= 0.2f", "p_view.z <= NEAREST", True),
+        ("1.0f / 255.0f", "FAINTEST", False),
+        ("float power =", "S[0][0] = scale.x; float power =", True),
+        ("float power =", "S[0][0] = wide.x; float power =", False),
+    ],
+)
+def test_a_rule_may_be_written_in_other_words(tmp_path, old, new, fits):
+    vendor(tmp_path)
+    edit(tmp_path / "submodules/a/cuda/forward.cu", old, new)
+    constants = "#define NEAREST 0.2f  // to eyes\n#define FAINTEST (1.0f / 2.0f)\n"
+    (tmp_path / "submodules/a/cuda/config.h").write_text(constants)
+    assert fits == (not errors(skeleton(tmp_path)))
+
+
 NORMAL = EWA.replace("0, 0, 0);", "p.x / l, p.y / l, p.z / l);")
 
 
@@ -74,6 +91,7 @@ def test_sources_that_a_file_compiles_at_import_are_read_too(tmp_path, projectio
     repo = skeleton(tmp_path)
     (tmp_path / f"{PACKAGE}.py").write_text(
         "folder = os.path.join(here, 'submodules', 'kernels')\n"
+        "GaussianRasterizationSettings = GaussianRasterizer = object\n"
         "_C = load(name='drawing', sources=[os.path.join(folder, 'cuda/forward.cu')])\n"
     )
     assert bool(errors(repo)) == (projection == TANGENT)

@@ -70,6 +70,9 @@ BINDING = '''"""Binds what its neighbour compiles."""
 from ..setup import _C
 
 
+class GaussianRasterizationSettings: ...
+
+
 class GaussianRasterizer:
     """Would draw."""
 '''

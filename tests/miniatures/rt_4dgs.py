@@ -195,6 +195,9 @@ RASTERIZER = '''"""Compiles itself when it is imported, where there is a compile
 raise ImportError("nvcc is not to be found")
 
 
+class GaussianRasterizationSettings: ...
+
+
 class GaussianRasterizer:
     def forward(
         self, means3D, means2D, opacities, shs=None, colors_precomp=None, flow_2d=None, ts=None,

@@ -79,7 +79,9 @@ def skeleton(
         "arguments/__init__.py": "class OptimizationParams:\n"
         "    def __init__(self, parser):\n        self.iterations = 12_345\n"
         + ("" if early else "        self.random_background = False\n"),
-        "scene/__init__.py": "class Scene:\n    def __init__(self, args, gaussians): ...\n",
+        "scene/__init__.py": "from scene.gaussian_model import GaussianModel\n\n\n"
+        "class Scene:\n    def __init__(self, args, gaussians): ...\n\n"
+        "    def save(self, iteration): ...\n",
         "scene/gaussian_model.py": "class GaussianModel:\n"
         + "\n".join(
             f"    def {name}({', '.join(filter(None, ['self', args]))}): {bodies.get(name, '...')}"
