@@ -10,12 +10,20 @@ from hypothesis import strategies as st
 
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import InputError, UsageError
-from fragprune_plugins.learning.goals import Control, Pressure
+from fragprune_plugins.learning.goals import Control, Portable, Pressure
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import MOMENTS, ThresholdStore
 from fragprune_plugins.workbench.figures.evaluate import Candidate, psnrs
+from fragprune_plugins.workbench.finetune import loop
 from fragprune_plugins.workbench.finetune.api import finetune
-from fragprune_plugins.workbench.finetune.relocation import DEEPER, SHARE, Relocation, least, split
+from fragprune_plugins.workbench.finetune.relocation import (
+    DEEPER,
+    PACE,
+    SHARE,
+    Relocation,
+    least,
+    split,
+)
 
 PARAMETERS = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
 
@@ -96,7 +104,7 @@ def test_what_the_photographs_pull_at_gets_a_twin(lacking):
 
 
 def test_rows_move_in_their_order_in_the_first_third():
-    moving = Relocation(torch.tensor([5, 3]), 6, 20)
+    moving = Relocation(torch.tensor([5, 3]), tiny.random_model(6), 20)
     assert [moving.moved(step) for step in (0, 1, 3, 4, 6, 20)] == [0, 0, 0, 1, 2, 2]
 
 
@@ -112,8 +120,9 @@ def test_what_is_to_go_is_never_split_and_twins_alone_lose_their_moments():
         model.xyz.grad[row] = pull / model.scaling[row].detach().exp().max()
     before = parameters(model)
     store = ThresholdStore(6)
-    moving = Relocation(torch.tensor([4, 2]), 6, 20)
-    moving.stepped(4, model, store, optimizer)
+    moving = Relocation(torch.tensor([4, 2]), model, 20)
+    optimizer.step = lambda: None
+    moving.step(4, model, store, optimizer)
     assert torch.equal(model.f_dc[4], before["f_dc"][1])  # of all that stay 1 is pulled hardest
     for name, leaf in leaves.items():
         same = [0, 2, 3, 5]
@@ -123,6 +132,39 @@ def test_what_is_to_go_is_never_split_and_twins_alone_lose_their_moments():
             assert not state[[1, 4]].any()
             assert state[same].all()
     assert not moving.pull.any()
+
+
+def test_a_step_is_a_share_of_the_size_but_of_a_few_medians_at_most():
+    model = tiny.random_model(5)
+    model.scaling.copy_(torch.tensor([1.0, 2.0, 0.5, 9.0, 1.0]).log()[:, None].expand(-1, 3))
+    model.scaling[:, 1:] -= 1  # the longest axis counts
+    xyz = model.xyz.clone().requires_grad_()
+    moving = Relocation(torch.tensor([0]), model, 100)
+    optimizer = torch.optim.Adam([{"params": [xyz], "lr": moving.rate}], eps=1e-15)
+    xyz.grad = torch.randn(5, 3)
+    moving.step(1, replace(model, xyz=xyz), ThresholdStore(5), optimizer)
+    moved = (xyz.detach() - model.xyz).abs()  # Adam's first step is the rate, whatever pulls
+    expected = PACE * torch.tensor([1.0, 2.0, 0.5, 3.0, 1.0])
+    torch.testing.assert_close(moved, expected[:, None].expand(-1, 3), atol=2e-6, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("goal", "smaller"), [(Pressure(1e-4), True), (Control(), False), (Portable(), False)]
+)
+def test_area_has_a_price_while_gaussians_move_and_cutoffs_learn(
+    lacking, monkeypatch, goal, smaller
+):
+    mine, dataset = lacking
+    settings, engine = Settings(iterations=60, goal=goal), create_engine("auto")
+
+    def sizes():
+        return finetune(mine, dataset, settings, engine=engine, relocate=torch.tensor([4]))
+
+    priced = sizes().model.scaling
+    monkeypatch.setattr(loop, "COMPACT", 0.0)
+    free = sizes().model.scaling
+    assert (priced.sum() < free.sum()) == smaller
+    assert torch.equal(priced, free) != smaller
 
 
 @pytest.mark.parametrize(

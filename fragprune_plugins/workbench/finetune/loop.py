@@ -31,7 +31,7 @@ from fragprune_plugins.types import RasterInputs, RasterOutputs, one_line
 from fragprune_plugins.workbench.finetune.faster import FrameTarget, require_reach
 from fragprune_plugins.workbench.finetune.losses import code_for, photometric_loss
 from fragprune_plugins.workbench.finetune.processes import Processes, SharedStage
-from fragprune_plugins.workbench.finetune.relocation import DEEPER, POSITIONS, Relocation
+from fragprune_plugins.workbench.finetune.relocation import COMPACT, DEEPER, Relocation
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints, configuration
 from fragprune_plugins.workbench.goals import Faster
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
@@ -140,7 +140,8 @@ class Training:
         self.relocation = None
         rates = rates_of(settings, dataset.extent, moves=relocate is not None)
         if relocate is not None:
-            self.relocation = Relocation(relocate, len(start), settings.iterations)
+            self.relocation = Relocation(relocate, start, settings.iterations)
+            rates["xyz"] = self.relocation.rate
             if isinstance(pressure := self.stage.pressure, ElasticPressure):
                 pressure.elasticity *= DEEPER
                 pressure.most *= DEEPER
@@ -313,9 +314,11 @@ class Training:
         self._plain_first = not all(map(stage.knows, shots))
         for shot in self.processes.ranks.share(shots):
             stage.picture = shot.name
-            outputs, pressure = self._draw(shot)
+            outputs, pressure, area = self._draw(shot)
             loss = photometric_loss(shot.looked_at(outputs.image), shot.image) / len(shots)
             stage.on_loss(loss)
+            if area is not None:
+                loss = loss + COMPACT * loss.detach() * area.log()
             torch.autograd.backward(loss if pressure is None else loss + pressure)
         stage.picture = ", ".join(shot.name for shot in shots)
         due = self._checkpoints is not None and self._checkpoints.due(self.done + 1)
@@ -323,16 +326,23 @@ class Training:
         for group in self.optimizer.param_groups:
             group["lr"] = stage.rate(group["name"], self.rates[group["name"]])
         stage.expect_sound()
-        self.optimizer.step()
-        if self.relocation is not None:
-            self.relocation.stepped(self.done + 1, self.model, stage.store, self.optimizer)
+        if self.relocation is None:
+            self.optimizer.step()
+        else:
+            self.relocation.step(self.done + 1, self.model, stage.store, self.optimizer)
         self.optimizer.zero_grad(set_to_none=True)
         stage.end()
         self.done += 1
         self.processes.stepped(self._learned(), self.done)
 
-    def _draw(self, shot: Shot) -> tuple[RasterOutputs, Tensor | None]:
-        """Draw a view with its thresholds; also return the pressure."""
+    @property
+    def _compacts(self) -> bool:
+        """Whether area has a price in this step, beside fragments."""
+        moving = self.relocation is not None and not self.relocation.over(self.done + 1)
+        return moving and self.settings.goal.learns and self.start.scaling.shape[1] == 3
+
+    def _draw(self, shot: Shot) -> tuple[RasterOutputs, Tensor | None, Tensor | None]:
+        """Draw a view with its thresholds; also the pressure, and the area where it has a price."""
         rules = self.stage.store.rules
         splats = self.model.splats(sh_apart=getattr(self.engine, "sh_apart", False))
         inputs = RasterInputs(shot.view, splats, planes=(), **rules)
@@ -347,8 +357,10 @@ class Training:
             whole = thresholds is None and inputs.stop is None and shown is inputs
             return outputs if whole else plain or self._plain(inputs)
 
-        area = area_per_pixel(inputs) if self.settings.goal.on_area else None
-        return outputs, self.stage.on_drawn(shot, outputs, untruncated, area=area)
+        on_area = self.settings.goal.on_area
+        area = area_per_pixel(inputs) if on_area or self._compacts else None
+        pressed, priced = (area, None) if on_area else (None, area)
+        return outputs, self.stage.on_drawn(shot, outputs, untruncated, area=pressed), priced
 
     @torch.no_grad()
     def _plain(self, inputs: RasterInputs) -> RasterOutputs:
@@ -365,8 +377,7 @@ def rates_of(settings: Settings, extent: float, *, moves: bool) -> dict[str, flo
         rates |= _GEOMETRY | {"xyz": _GEOMETRY["xyz"] * extent}
     dropout = settings.dropout and settings.train == "all" and not settings.itself
     lively = _WHILE_MOVING if moves else _WITH_DROPOUT if dropout else 1.0
-    times = {"opacity": 1.0} | ({"xyz": POSITIONS} if moves else {})
-    return {name: times.get(name, lively) * rate for name, rate in rates.items()}
+    return {name: rate if name == "opacity" else lively * rate for name, rate in rates.items()}
 
 
 def order(

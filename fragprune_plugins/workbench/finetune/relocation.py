@@ -27,12 +27,19 @@ from fragprune_plugins.workbench.pruning import removal_error
 SHARE = 0.15
 """Of the Gaussians, that move; docs/results.md has the runs that chose this and what follows."""
 
-POSITIONS = 10.0
-"""Times the usual rate of positions: the hosts' first, for what moved has a place to find."""
+PACE = 0.02
+"""Of its longest axis, that a Gaussian moves in a step at first: what moved has a place to find.
+
+A rate in units of the scene suits one scene, and is three times too fast or slow for another.
+"""
+
+COMPACT = 0.1
+"""Per cents of the loss that one of the ellipses' area is worth while Gaussians move."""
 
 DEEPER = 1.6
 """Times the usual default pressure, and its upper end: the better picture affords deeper cuts."""
 
+_LARGEST = 3.0  # medians, of the size that counts: skies take steps that change much of a picture
 _ROUNDS, _FIRST, _LAST = 10, 0.05, 0.3  # of the run: what moves later has not settled at its end
 _APART = 0.7  # twins' distance from the whole, over its longest axis: they are as long together
 _OPACITY = 0.7  # of a twin, over that of the whole
@@ -66,24 +73,28 @@ class Relocation:
 
     Args:
         rows: (M,) int64, of N Gaussians those that move, the one worth least first.
-        count: N, at least 2 M.
+        model: the N, at least 2 M.
         steps: of the run.
 
     Raises:
         InputError: these are not such rows.
 
     Attributes:
+        rate: initial learning rate of positions, for a Gaussian of median size.
         pull: (2, N) float32, since the last move: how much the loss would change if a Gaussian
             moved by its own size, summed over the views that see it, and the number of these.
     """
 
-    def __init__(self, rows: Tensor, count: int, steps: int) -> None:
+    def __init__(self, rows: Tensor, model: Model, steps: int) -> None:
+        count = len(model)
         known = rows.dtype == torch.int64 and rows.ndim == 1 and 2 * len(rows) <= count
         if not known or len(set(rows.tolist())) < len(rows) or ((rows < 0) | (rows >= count)).any():
             found = f"{rows.dtype} of shape {tuple(rows.shape)}, or a row twice, or of no Gaussian"
             expected = f"torch.int64, at most half of {count} rows, each once"
             raise InputError("relocate", found, expected, "Pass what spare(model, views) gives.")
         self._rows, self._steps = rows, steps
+        self._median = float(_sizes(model).median())
+        self.rate = PACE * self._median
         self.pull = torch.zeros(2, count, device=rows.device)
 
     def moved(self, step: int) -> int:
@@ -91,20 +102,27 @@ class Relocation:
         over = (step / self._steps - _FIRST) / (_LAST - _FIRST)
         return len(self._rows) * int(_ROUNDS * min(1.0, max(0.0, over))) // _ROUNDS
 
+    def over(self, step: int) -> bool:
+        """Whether all have moved when a step begins."""
+        return self.moved(step - 1) == len(self._rows)
+
     @torch.no_grad()
-    def stepped(
+    def step(
         self, step: int, model: Model, store: ThresholdStore, optimizer: torch.optim.Optimizer
     ) -> None:
-        """Take note of gradients, which a step has left; move what is to move after this step.
+        """The optimizer's step, large Gaussians further than small ones; then some move.
 
         Args:
             step: counted from 1.
             model: whose parameters the optimizer moves, all of them; changed in place.
         """
-        if self.moved(step) == len(self._rows) == self.moved(step - 1):
+        before, sizes = model.xyz.detach().clone(), _sizes(model) / self._median
+        optimizer.step()
+        model.xyz.copy_(before.lerp(model.xyz, sizes.clamp(max=_LARGEST)[:, None]))
+        if self.over(step):
             return
         assert model.xyz.grad is not None
-        pull = model.xyz.grad.norm(dim=1) * model.scaling.exp().amax(dim=1)
+        pull = model.xyz.grad.norm(dim=1) * _sizes(model)
         self.pull += torch.stack([pull, (pull > 0).float()])
         leaving = self._rows[self.moved(step - 1) : self.moved(step)]
         if not len(leaving):
@@ -123,6 +141,11 @@ class Relocation:
         origins[leaving] = wholes
         store.rearrange(origins, fresh)
         self.pull.zero_()
+
+
+def _sizes(model: Model) -> Tensor:
+    """(N,) the longest axes."""
+    return model.scaling.detach().exp().amax(dim=1)
 
 
 def split(parameters: Mapping[str, Tensor], wholes: Tensor, others: Tensor) -> None:
