@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 from fragprune_plugins.adapting import HostRepo, NotComparedError, hookimpl
@@ -16,7 +17,7 @@ from fragprune_plugins.errors import HostFailed
 from fragprune_plugins.injection import process, ranks
 from fragprune_plugins.injection.options import RunOptions, RunSummary
 from fragprune_plugins.injection.session import active_session
-from fragprune_plugins.learning.events import Summary
+from fragprune_plugins.learning.events import StepStats, Summary
 from fragprune_plugins.learning.interruption import sigterm_interrupts
 from fragprune_plugins.plugins.loading import installed
 
@@ -24,9 +25,16 @@ log = logging.getLogger("fragprune")
 
 
 class Recorder:
-    """A plugin that records the summary of a session."""
+    """A plugin that records the curves and the summary of a session."""
 
-    summary: Summary | None = None
+    def __init__(self) -> None:
+        self.summary: Summary | None = None
+        self.curves: list[dict[str, float]] = []
+
+    @hookimpl
+    def fragprune_step(self, stats: StepStats) -> None:
+        """Record a step."""
+        self.curves.append(asdict(stats))
 
     @hookimpl
     def fragprune_finished(self, summary: Summary) -> None:
@@ -71,10 +79,11 @@ def run(
     finally:
         plugins.remove("run")
         session = active_session()
+        output = session.output if session is not None else None
         if session is not None:
             session.deactivate()
     learned = recorder.summary
-    if session is None or learned is None:
+    if learned is None:
         found, expected = "ended before the end of stage 2", "a training that runs to its end"
         raise HostFailed(script.name, found, expected, process.READ)
     frame = "photographs and cameras in the host's own frame"
@@ -83,7 +92,7 @@ def run(
         device=device,
         stage=options.stage,
         train_seconds=time.perf_counter() - started,
-        curves=session.curves,
-        output=session.output,
+        curves=recorder.curves,
+        output=output,
         not_compared=NotComparedError(name, frame, "its own evaluation", f"Run: {evaluation}"),
     )
