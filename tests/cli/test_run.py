@@ -188,6 +188,17 @@ def test_what_a_host_that_tidies_up_takes_away_is_missed(
     fails("run", *WORDS, *command(scene, tmp_path / "out", host=host), says=said, code=1)
 
 
+def test_a_host_prints_in_every_process_of_several(scene, host, tmp_path, monkeypatch):
+    """Fine-tuning and rendering share their work, and print in the first: no other command does."""
+    with (host / "train.py").open("a") as script:
+        script.write("    print('trained by', os.environ['RANK'])\n")
+    edit(host / "train.py", "import sys\n", "import os\nimport sys\n")
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setenv("RANK", "1")
+    words = command(scene, tmp_path / "out", host=host)
+    assert "trained by 1" in run("run", "--device", "cpu", "--stage", "off", *words).stdout
+
+
 @pytest.mark.parametrize("last", [10, 14])
 def test_a_stage_two_that_a_host_cuts_short_is_told(scene, host, tmp_path, last, caplog):
     edit(host / "train.py", "opt.iterations + 1", f"min(opt.iterations, {last}) + 1")

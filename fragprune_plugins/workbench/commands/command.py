@@ -72,7 +72,7 @@ class Command(click.Command):
         try:
             for rule in self.rules:
                 rule.check(ctx)
-            with _machine_stated(ctx.command_path), _first_process_prints():
+            with _machine_stated(ctx.command_path):
                 report: Report | None = super().invoke(ctx)
         except FragpruneError as error:
             raise _stated(error, as_json=as_json) from error
@@ -176,7 +176,7 @@ def usage_error(error: click.UsageError, words: list[str]) -> Exception:
 
 
 @contextlib.contextmanager
-def _first_process_prints() -> Iterator[None]:
+def first_process_prints() -> Iterator[None]:
     """Inside, only the first of several processes prints."""
     with contextlib.ExitStack() as stack:
         if not launched().first:

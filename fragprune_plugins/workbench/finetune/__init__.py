@@ -8,7 +8,12 @@ from typing import Any
 import click
 
 from fragprune_plugins.workbench.commands import options as shared
-from fragprune_plugins.workbench.commands.command import Command, Report, work_of
+from fragprune_plugins.workbench.commands.command import (
+    Command,
+    Report,
+    first_process_prints,
+    work_of,
+)
 from fragprune_plugins.workbench.commands.config import config_option
 from fragprune_plugins.workbench.commands.learning import LEARNING_APART, learning_options
 from fragprune_plugins.workbench.commands.logs import log_option
@@ -97,6 +102,7 @@ RULES = (
     "--again", is_flag=True, help="Begin anew, though OUT is finished or there is a checkpoint."
 )
 @shared.engine_options()
+@first_process_prints()
 def command(**options: Any) -> Report | None:
     """Learn how far each Gaussian of MODEL must reach.
 

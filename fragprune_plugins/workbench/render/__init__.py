@@ -7,7 +7,12 @@ from typing import Any
 import click
 
 from fragprune_plugins.workbench.commands import options as shared
-from fragprune_plugins.workbench.commands.command import Command, Report, work_of
+from fragprune_plugins.workbench.commands.command import (
+    Command,
+    Report,
+    first_process_prints,
+    work_of,
+)
 from fragprune_plugins.workbench.commands.rules import Needs, apart
 
 
@@ -57,6 +62,7 @@ RULES = (
 @shared.truncation_option
 @shared.shard_option
 @shared.engine_options()
+@first_process_prints()
 def command(**options: Any) -> Report | None:
     """Render MODEL from many cameras, with one PNG for each camera, or as a film.
 
