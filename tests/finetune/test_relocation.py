@@ -167,6 +167,17 @@ def test_area_has_a_price_while_gaussians_move_and_cutoffs_learn(
     assert torch.equal(priced, free) != smaller
 
 
+@pytest.mark.parametrize("what", ["in no picture", "surfels"])
+def test_what_has_no_area_pays_for_none(lacking, what):
+    mine, dataset = lacking
+    if what == "surfels":
+        mine = replace(mine, scaling=mine.scaling[:, :2].contiguous())
+    else:
+        mine = replace(mine, xyz=mine.xyz - torch.tensor([0.0, 0.0, 100.0]))
+    result = finetune(mine, dataset, Settings(iterations=10), relocate=torch.tensor([4]))
+    assert result.progress.steps == 10
+
+
 @pytest.mark.parametrize(
     "rows",
     [[0, 1, 2, 3], [4, 4], [6], [-1], [4.0], [True, *[False] * 5], [[4]]],

@@ -46,6 +46,7 @@ _WITH_DROPOUT, _WHILE_MOVING = 4.0, 2.0
 docs/results.md. Its own pictures teach worse so: 29.75 dB in place of 29.89 on fox (--self
 --dropout 0.2)."""
 _POSTFIXES = 100  # times in a run that the bar says how it goes
+_LEAST_AREA = 1e-12  # per pixel: a view may show nothing, and has no gradient then
 
 _OF_VIEWS = {"before", "after"}  # of stage 2's tensors; all others have a row for each Gaussian
 _UNFIT = (  # raised where the parts of a checkpoint do not fit what they are loaded into
@@ -318,7 +319,7 @@ class Training:
             loss = photometric_loss(shot.looked_at(outputs.image), shot.image) / len(shots)
             stage.on_loss(loss)
             if area is not None:
-                loss = loss + COMPACT * loss.detach() * area.log()
+                loss = loss + COMPACT * loss.detach() * area.clamp(min=_LEAST_AREA).log()
             torch.autograd.backward(loss if pressure is None else loss + pressure)
         stage.picture = ", ".join(shot.name for shot in shots)
         due = self._checkpoints is not None and self._checkpoints.due(self.done + 1)
