@@ -404,8 +404,9 @@ class RasterInputs:
         alpha_max: alpha is capped here; 1/255 to 1.
         cap_gradient: the gradient passes through the cap; else it is 0 where alpha was capped.
         stop: a share of a pixel's light, 1e-4 to 1; ``alpha_max`` is then at most 0.999. The pixel
-            draws the fragment that leaves less of its light, and stops behind it. None for the
-            hosts' rule: it stops before the fragment that would leave less than 1e-4.
+            draws the fragment that leaves less of its light, and stops behind it. Gradients take
+            what it leaves out to look like that fragment. None for the hosts' rule: the pixel stops
+            before the fragment that would leave less than 1e-4.
         rim: how a threshold cuts. "hard": a pixel whose centre lies outside draws no fragment, and
             the threshold's gradient is a surrogate. "soft": alpha is times the share of the pixel
             that is covered, clamp(1/2 + d, 0, 1), d being the distance of its centre to the rim

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from reference_renderer.composite import alive, transmittances, weights_of
+from reference_renderer.composite import alive, composed, transmittances, weights_of
 from reference_renderer.fragment import fragments
 from reference_renderer.project import (
     TILE,
@@ -280,12 +280,15 @@ def draw(
     more = [] if here.features is None else [here.features]
     channels = torch.cat([here.color, 1 / here.depth[:, None], *more], dim=1)
     alpha = found.alpha * live
-    weights, left = weights_of(alpha), transmittances(alpha)[-1:]
+    weights, left = composed(alpha, options.stop)
     counted = (found.drawn & live).to(torch.int32)
     shape = (len(block.y), len(block.x))
     surface = None
     if found.depth is not None and here.normal is not None:
-        surface = surface_of(alpha, found.drawn & live, found.depth, here.normal, options.near)
+        lit = transmittances(alpha)[:-1]
+        surface = surface_of(
+            weights, lit, found.drawn & live, found.depth, here.normal, options.near
+        )
         surface = surface.reshape(-1, *shape)
     return Drawing(
         layers=torch.cat([channels.mT @ weights, left]).reshape(-1, *shape),

@@ -13,7 +13,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from reference_renderer.composite import transmittances
 from reference_renderer.covariance import rotation_matrices
 from reference_renderer.project import Footprints, colors_of, transform
 from reference_renderer.scene import Camera, Gaussians, Options
@@ -118,7 +117,9 @@ def meet(plane: Tensor, pixels: Tensor, filtered: Tensor, near: float) -> tuple[
     return torch.where(met, q, -1), torch.where(met, depth, 1)
 
 
-def surface_of(alpha: Tensor, drawn: Tensor, depth: Tensor, normal: Tensor, near: float) -> Tensor:
+def surface_of(
+    weights: Tensor, light: Tensor, drawn: Tensor, depth: Tensor, normal: Tensor, near: float
+) -> Tensor:
     """(6, P): sum of w depth, of w normal (3), the median depth, the distortion.
 
     The median depth is that of the last drawn fragment before which more than half of the light is
@@ -126,14 +127,14 @@ def surface_of(alpha: Tensor, drawn: Tensor, depth: Tensor, normal: Tensor, near
     w_i w_j (m_i - m_j)^2, where m maps depths near to 0 and ``FAR`` to 1, evenly in 1 / depth.
 
     Args:
-        alpha: (K, P) front to back, 0 where not drawn or stopped; w is alpha T.
+        weights: (K, P) front to back, 0 where not drawn or stopped; w.
+        light: (K, P) before each fragment.
         drawn: (K, P) bool.
         depth: (K, P) of the fragments.
         normal: (K, 3) view space.
         near: view depth.
     """
-    light = transmittances(alpha)[:-1]
-    weights, used = alpha * light, 1 - light
+    used = 1 - light
     none = depth.new_zeros(1, depth.shape[1])
     place = torch.arange(1, len(depth) + 1, device=depth.device)[:, None]
     last = torch.cat([none.long(), place * (drawn & (light.detach() > 0.5))]).amax(dim=0)

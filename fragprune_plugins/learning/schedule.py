@@ -17,7 +17,7 @@ Train = Literal["opacity", "appearance", "all"]
 FINETUNE_ITERATIONS = 5000
 QUICK_ITERATIONS = 1000
 ITERATIONS_MAX = 10**9
-USUAL_STOP = 0.01  # share of a pixel's light; docs/results.md has the runs that chose it
+USUAL_STOP = 0.02  # share of a pixel's light; docs/results.md has the runs that chose it
 
 _DEFAULT_GOAL = Pressure()
 _DECAY = 0.1  # learning rates fall to this share over the run, exponentially

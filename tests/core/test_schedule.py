@@ -77,24 +77,24 @@ def test_settings_out_of_range_are_usage_errors_that_name_them(wrong):
 
 
 @pytest.mark.parametrize(
-    ("settings", "of_plain_models", "of_models_with_002"),
+    ("settings", "of_plain_models", "of_models_with_005"),
     [
-        ({}, USUAL_STOP, 0.02),
-        ({"goal": Fewer(2)}, USUAL_STOP, 0.02),
-        ({"goal": Control()}, None, 0.02),
-        ({"goal": Portable()}, None, 0.02),
-        ({"itself": True}, None, 0.02),
-        ({"stop": None}, None, 0.02),
+        ({}, USUAL_STOP, 0.05),
+        ({"goal": Fewer(2)}, USUAL_STOP, 0.05),
+        ({"goal": Control()}, None, 0.05),
+        ({"goal": Portable()}, None, 0.05),
+        ({"itself": True}, None, 0.05),
+        ({"stop": None}, None, 0.05),
         ({"stop": 0.05}, 0.05, 0.05),
         ({"stop": 0.05, "goal": Control()}, 0.05, 0.05),
     ],
 )
 def test_models_that_learn_thresholds_from_photographs_get_the_usual_stop(
-    settings, of_plain_models, of_models_with_002
+    settings, of_plain_models, of_models_with_005
 ):
     stop_of = Settings(**settings).stop_of
     assert stop_of(None) == of_plain_models
-    assert stop_of(0.02) == of_models_with_002
+    assert stop_of(0.05) == of_models_with_005
 
 
 @pytest.mark.parametrize(

@@ -151,9 +151,9 @@ def test_a_stop_is_priced_on_a_model_without_one_and_is_its_own_on_another():
     splat, views = tiny.random_model(), [("view", tiny.cameras()[0].view())]
     plain, _ = audit(splat, views, engine=ENGINE, repeats=1)
     priced = plain["cuts"][-1]
-    stopped, _ = audit(splat.with_rules(stop=0.01), views, engine=ENGINE, repeats=1)
-    assert (plain["stop"], stopped["stop"]) == (None, 0.01)
-    assert priced["name"] == "a stop at 0.01"
+    stopped, _ = audit(splat.with_rules(stop=0.02), views, engine=ENGINE, repeats=1)
+    assert (plain["stop"], stopped["stop"]) == (None, 0.02)
+    assert priced["name"] == "a stop at 0.02"
     assert priced["fragments_per_pixel"] == stopped["fragments_per_pixel"]
     assert stopped["cuts"][-1]["name"] == UNTRUNCATED
     assert stopped["cuts"][-1]["fragments_per_pixel"] == plain["fragments_per_pixel"]

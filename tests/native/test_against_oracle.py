@@ -159,7 +159,7 @@ def check_gradients(engine, inputs, thresholds, same, tolerance=GRADIENT_TOLERAN
         assert found.shape == expected.shape
         assert found.isfinite().all(), name
         if expected.numel():
-            scale = expected.abs().max().item() + 1e-3
+            scale = expected.abs().max().item() + 1e-2  # terms that cancel leave their rounding
             assert (found - expected).abs().max().item() < tolerance * scale, name
 
 

@@ -117,7 +117,7 @@ def test_every_input_has_the_derivative_of_finite_differences(kind, rim):
     assert gradcheck(drawn, (*leaves.values(), tau))
 
 
-def test_behind_a_stop_derivatives_are_those_of_finite_differences():
+def test_what_a_stop_leaves_out_has_the_derivatives_of_a_look_alike_of_the_last_fragment():
     scene, leaves = scenes.leaves(replace(smooth_scene(colors=True), stop=0.52))
     hook = leaves.pop("means2d_hook")
     names, options = list(leaves), uncut(scene)
@@ -129,9 +129,22 @@ def test_behind_a_stop_derivatives_are_those_of_finite_differences():
             camera, replace(gaussians_of(scene.splats), **given), means2d_hook=hook, options=options
         )
 
-    found = drawn(*leaves.values()).fragments
-    assert {1, 2, 3} <= set(found.flatten().tolist())
-    assert gradcheck(lambda *tensors: outputs(drawn(*tensors))[:3], tuple(leaves.values()))
+    first = drawn(*leaves.values())
+    assert {1, 2, 3} <= set(first.fragments.flatten().tolist())
+    splats, stopped = scene.splats, 1 - first.alpha.detach() < scene.stop
+    depth = (splats.means @ scene.view.viewmatrix[:3, :3] + scene.view.viewmatrix[3, :3])[:, 2]
+    last = depth.argsort()[first.fragments.long() - 1]
+    color, behind = splats.colors[last].movedim(-1, 0), scene.view.background[:, None, None]
+    added = (color - behind).detach(), (1 / depth)[last][None].detach(), torch.ones_like(last)
+
+    def filled(*tensors):
+        made = drawn(*tensors)
+        left = torch.where(stopped, 1 - made.alpha, 0).detach()
+        return tuple(  # these values, with the derivatives as they are given
+            value + left * more for value, more in zip(outputs(made)[:3], added, strict=True)
+        )
+
+    assert gradcheck(filled, tuple(leaves.values()))
 
 
 @pytest.mark.parametrize("features", [0, 2])

@@ -102,7 +102,8 @@ def explicit_gradients(inputs, tau, pressure):
     """dL/dtau by the double loop: rim fragments before the stop, drawn or not.
 
     -sum alpha s(1-s)/w dL/dalpha, where dL/dalpha = T (c - C_behind) dL/dC, with T and C_behind
-    untouched at fragments that are not drawn; and -sum s(1-s)/w per pixel for the pressure.
+    untouched at fragments that are not drawn, and behind a stop what its last fragment looks like;
+    and -sum s(1-s)/w per pixel for the pressure.
     """
     result = [0.0] * N
     background = [*inputs.view.background.tolist(), 0.0]
@@ -110,7 +111,11 @@ def explicit_gradients(inputs, tau, pressure):
     for y in range(HEIGHT):
         for x in range(WIDTH):
             records, light = naive.records_at(splats, x, y, stop=inputs.stop)
-            behind = [light * b for b in background]  # what all later fragments add
+            seen = background
+            if inputs.stop and light < inputs.stop:
+                last = [r for r in records if r.drawn][-1]
+                seen = [*last.color, 1 / last.depth]
+            behind = [light * b for b in seen]  # what all later fragments add
             for r in reversed(records):
                 feature = [*r.color, 1 / r.depth]
                 after = r.light * (1 - r.alpha) if r.drawn else r.light

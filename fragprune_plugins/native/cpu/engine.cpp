@@ -341,7 +341,9 @@ FP_STAGE void forward(const fragprune_inputs& in, float spread, fragprune_output
 struct Losses {
   const fragprune_output_grads& grads;
   float background[3];
+  float stop;
   size_t plane;
+  const Extras& extras;
 };
 
 // One plane of the image into block order; pixels outside the image, and a plane of NULL, are 0.
@@ -363,9 +365,11 @@ void load_plane(const Camera<float>& c, const Tile& tile, const float* plane, fl
   }
 }
 
-// Brings a tile's loss gradients into block order and starts the walk from the last fragment.
-void load_losses(const Camera<float>& c, const Losses& from, int features, const Tile& tile,
+// Brings a tile's loss gradients into block order and starts the walk from the last fragment. What
+// a pixel's stop left out is taken to look like that fragment.
+void load_losses(const Camera<float>& c, const Losses& from, const Splat* splats, const Tile& tile,
                  const TilePixels& kept, LossPixels& to, double* by_background) {
+  const int features = from.extras.feature_count;
   const float* image = from.grads.image;
   float alpha[kPixels];
   load_plane(c, tile, image, to.r);
@@ -389,6 +393,15 @@ void load_losses(const Camera<float>& c, const Losses& from, int features, const
     sums[0] = sums[0] + light * r, sums[1] = sums[1] + light * g, sums[2] = sums[2] + light * b;
   }
   for (int k = 0; k < 3; k++) by_background[k] = sum(sums[k]);
+  for (int i = 0; i < kPixels; i++) {
+    if (kept.transmittance[i] >= from.stop || kept.stop[i] == 0) continue;  // 0: outside the image
+    const Splat& last = splats[tile.list[kept.stop[i] - 1]];
+    const Brush<float>& is = last.brush;
+    float shade = to.r[i] * is.r + to.g[i] * is.g + to.b[i] * is.b + to.inv_z[i] * is.inv_z;
+    for (int k = 0; k < features; k++)
+      shade += to.features[k][i] * from.extras.features[size_t{last.id} * features + k];
+    to.behind[i] = kept.transmittance[i] * shade;
+  }
 }
 
 using UnblendTile = void (*)(const Splat*, const Tile&, const TilePixels&, const CellSlots&,
@@ -593,7 +606,9 @@ FP_STAGE void backward(const fragprune_state& state, const fragprune_output_grad
   const size_t tiles_x = static_cast<size_t>(state.camera.tiles_x), tiles = state.pixels.size();
   const Losses losses{grads,
                       {in.background[0], in.background[1], in.background[2]},
-                      static_cast<size_t>(in.width) * in.height};
+                      in.stop,
+                      static_cast<size_t>(in.width) * in.height,
+                      extras};
   const float pixels = static_cast<float>(losses.plane);
   const Asked asked{grads.fragments_per_pixel / pixels, in.alpha_max,        in.cap_gradient != 0,
                     extras,                             state.camera.width,  state.camera.height};
@@ -612,7 +627,7 @@ FP_STAGE void backward(const fragprune_state& state, const fragprune_output_grad
                       static_cast<int>(kept.first[x % kCell + 1] - from)};
       const size_t t = row * tiles_x + x;
       LossPixels loss;
-      load_losses(state.camera, losses, extras.feature_count, tile, state.pixels[t], loss,
+      load_losses(state.camera, losses, scene.splats.data(), tile, state.pixels[t], loss,
                   &by_background[3 * t]);
       if (per_gaussian)
         unblend(scene.splats.data(), tile, state.pixels[t], slots, asked, loss, sums.data());

@@ -276,7 +276,7 @@ inline void undraw_surfel_tile(const SurfelScene& scene, size_t t, const fragpru
       const Lanes falloff = surfel_falloff(select(reached, m.q, all(0.f)));
       const Lanes uncapped = all(s.opacity) * falloff, full = capped(uncapped, in.alpha_max);
       const Lanes alpha = where(drawn, full), inv = one / (one - alpha);
-      const Lanes before = load(light + at) * inv, later = load(behind + at);
+      const Lanes after = load(light + at), before = after * inv;
       const auto loss = [&](int k) { return load(g[k] + at); };
       const Lanes depth = select(reached, m.depth, one);
       Lanes shade = loss(0) * all(s.colour.x) + loss(1) * all(s.colour.y) +
@@ -297,8 +297,11 @@ inline void undraw_surfel_tile(const SurfelScene& scene, size_t t, const fragpru
         for (int k = 0; k < 3; k++)
           sums[kByNormal + k] = fma(weight, loss(5 + k), sums[kByNormal + k]);
       }
+      // What a pixel's stop left out is taken to look like the last fragment.
+      const Mask goes_on = gt(load(kept.stop + at), broadcast_int(place + (in.stop > 0)));
+      const Lanes later = select(goes_on, load(behind + at), after * shade);
       const Lanes by_alpha = fnma(later, inv, before * shade);
-      store(light + at, select(drawn, before, load(light + at)));
+      store(light + at, select(drawn, before, after));
       store(behind + at, fma(weight, shade, later));
       for (int k = 0; k < 3; k++)
         sums[kByColour + k] = fma(weight, loss(k), sums[kByColour + k]);

@@ -106,6 +106,21 @@ struct LossPixel {
   float behind;  // gradient of all that lies behind it, weighted
 };
 
+// dL/dw of a Gaussian's weight in a pixel.
+template <class B>
+__device__ inline float shade_of(const Frame& f, const B& b, uint32_t entry, const LossPixel& p) {
+  float shade = fma(p.b, b.b, fma(p.g, b.g, p.r * b.r));
+#if FP_DEPTH
+  shade = fma(p.inv_z, b.inv_z, shade);
+#endif
+#if FP_FEATURES
+  const float* features = f.in.features + size_t{FP_FEATURES} * row_of(f, entry);
+#pragma unroll
+  for (int k = 0; k < FP_FEATURES; k++) shade = fma(p.features[k], features[k], shade);
+#endif
+  return shade;
+}
+
 // Takes a pixel from behind a fragment before its stop to before it; what is left of the fragment.
 __device__ inline void unblend(const Undraw& u, const LocalBrush<float>& b, const Rim& rim,
                                uint32_t entry, float per_fragment, const Meeting<float>& m,
@@ -116,16 +131,7 @@ __device__ inline void unblend(const Undraw& u, const LocalBrush<float>& b, cons
   const float alpha = drawn ? full : 0.f;
   const float inv = reciprocal(1.f - alpha);
   const float light = p.light * inv;
-  float shade = fma(p.b, b.b, fma(p.g, b.g, p.r * b.r));
-#if FP_DEPTH
-  shade = fma(p.inv_z, b.inv_z, shade);
-#endif
-#if FP_FEATURES
-  const float* features = f.in.features + size_t{FP_FEATURES} * row_of(f, entry);
-#pragma unroll
-  for (int k = 0; k < FP_FEATURES; k++) shade = fma(p.features[k], features[k], shade);
-#endif
-  const float weight = alpha * light;
+  const float shade = shade_of(f, b, entry, p), weight = alpha * light;
   const float by_alpha = fnma(p.behind, inv, light * shade);
   p.light = light;
   p.behind = fma(weight, shade, p.behind);
@@ -227,7 +233,8 @@ __device__ inline void gather(const Frame& f, const Room& room, int j, float (&v
 #endif
 }
 
-__device__ inline LossPixel load_loss(const Undraw& u, const Pixel& p) {
+// What a pixel's stop left out is taken to look like its last fragment.
+__device__ inline LossPixel load_loss(const Undraw& u, const Pixel& p, const Range& range) {
   const Frame& f = u.frame;
   const size_t plane = static_cast<size_t>(f.in.width) * f.in.height;
   const auto at = [&](const float* of, size_t channel) {
@@ -242,7 +249,12 @@ __device__ inline LossPixel load_loss(const Undraw& u, const Pixel& p) {
 #endif
   l.light = p.inside ? f.transmittance[p.at] : 1.f;
   const float* back = f.in.background;
-  l.behind = l.light * (l.r * back[0] + l.g * back[1] + l.b * back[2] - at(u.by.alpha, 0));
+  float shade = l.r * back[0] + l.g * back[1] + l.b * back[2] - at(u.by.alpha, 0);
+  if (l.light < f.in.stop) {
+    const uint32_t last = f.entry_values[range.first + f.stop[p.at] - 1];
+    shade = shade_of(f, load_brush(f.brushes, row_of(f, last)), last, l);
+  }
+  l.behind = l.light * shade;
   return l;
 }
 
@@ -375,7 +387,7 @@ FP_KERNEL(fp_unblend, Undraw, kResident) {
   const int warp = warp_of(), lane = lane_of();
   const Pixel p = pixel_of(frame);
   const Range range = frame.ranges[blockIdx.x];
-  LossPixel loss = load_loss(f, p);
+  LossPixel loss = load_loss(f, p, range);
   const int32_t stop = p.inside ? frame.stop[p.at] : 0;
   const float per_fragment =
       f.by_fragments ? *f.by_fragments / (static_cast<float>(frame.in.width) *

@@ -121,7 +121,8 @@ typedef struct fragprune_inputs {
   float near;              /* Gaussians at this view depth or less are culled; 0 or more */
   float alpha_max;         /* alpha is capped here; 1/255 to 1, or to 0.999 with a stop */
   float stop;              /* 1e-4 to 1: a pixel draws the fragment that leaves less of its light, and
-                              stops behind it; 0: it stops before one that would leave less than 1e-4 */
+                              stops behind it, and gradients take what it leaves out to look like that
+                              fragment; 0: it stops before one that would leave less than 1e-4 */
   int32_t compensation;    /* enum fragprune_compensation */
   int32_t cap_gradient;    /* the gradient passes through the cap; else it is 0 where capped */
   int32_t absolute_gradient; /* fill the hook's third column, see fragprune_input_grads */

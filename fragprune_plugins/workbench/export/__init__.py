@@ -32,7 +32,7 @@ from fragprune_plugins.workbench.models import formats
     type=Number(TRANSMITTANCE_MIN, 1),
     metavar="SHARE",
     help="Give the model a stop, also one that was never fine-tuned: a pixel draws the fragment "
-    "that leaves less than this share of its light, and ends there. 0.01 is usual.",
+    "that leaves less than this share of its light, and ends there. 0.02 is usual.",
 )
 @truncation_option
 def command(**options: Any) -> Report:
@@ -55,7 +55,7 @@ def command(**options: Any) -> Report:
       fragprune export pruned.ply --out for_viewer.ply
       fragprune export pruned.ply --out pruned.spz
       fragprune export model.spz --out model.ply --no-truncation
-      fragprune export model.ply --out faster.ply --stop 0.01
+      fragprune export model.ply --out faster.ply --stop 0.02
       fragprune export edited.ply pruned.ply --out again.ply
     """
     return work_of(__name__, **options)
