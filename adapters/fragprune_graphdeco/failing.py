@@ -242,14 +242,18 @@ _CAMERA = re.compile(r"viewpoint(_?cam(era)?)?")
 
 
 def _of_cameras(repo: HostRepo, module: str) -> Iterator[str]:
-    """Attributes that a script reads of its cameras, and that neither their class nor code sets."""
+    """Attributes that a script reads of its cameras, and that nothing sets but for cameras that
+    derive from those.
+    """
     tree, camera = repo.tree(module), repo.definition("scene.cameras", "Camera")
     bases = {text_of(each) for each in getattr(camera, "bases", ())}
     made = "return Camera(" in text_of(repo.function("utils.camera_utils", "loadCam"))
     if not made or bases - {"nn.Module", "torch.nn.Module", "object"}:
         return
-    own = {text_of(each) for each in every(camera, ast.Attribute)}
-    own |= {f"self.{getattr(node, 'name', '')}" for node in nodes(camera)}
+    classes = every(repo.tree("scene.cameras"), ast.ClassDef)
+    alike = [each for each in classes if "Camera" not in map(text_of, each.bases)]
+    own = {text_of(node) for each in alike for node in every(each, ast.Attribute)}
+    own |= {f"self.{getattr(node, 'name', '')}" for each in alike for node in nodes(each)}
     texts = "".join(map(repo.read, sorted(repo.root.glob("scene/*.py"))))
     texts += "".join(texts_of(repo).values())
     called = {each.func for each in every(tree, ast.Call)} | _perhaps(repo, module)

@@ -1133,6 +1133,11 @@ CAMERA = """class Camera(nn.Module):
 class Posed(Camera):
     def __init__(self, image):
         self.turned = True
+
+
+class Raw(nn.Module):
+    def __init__(self, image):
+        self.raw = image
 """
 
 
@@ -1144,6 +1149,7 @@ class Posed(Camera):
         ("viewpoint_cam.turned", "", False),
         ("viewpoint_cam.turned if hasattr(viewpoint_cam, 'turned') else 0", "", True),
         ("viewpoint_cam.width", "", True),
+        ("viewpoint_cam.raw", "", True),
         ("viewpoint_cam.cpu()", "", True),
         ("1\n        viewpoint_cam.seen = viewpoint_cam.seen + 1", "", True),
     ],
