@@ -322,12 +322,16 @@ class GraphdecoAdapter(ScriptAdapter):
         module, accepted = self._accepted()
         values = ", ".join(("the values of 3DGS", *self.drawn_from))
         found = []
-        for name in dict.fromkeys(each.function for each in accepted):
-            body = repo.function(module, name)
-            drawn = Drawing(repo, module, body, self.drawn_from).inputs() if body else ()
-            found += [(name, reason, f"a drawing of {values}") for reason, _ in drawn]
+        names = dict.fromkeys(each.function for each in accepted)
+        for name, body in ((name, repo.function(module, name)) for name in names):
+            if body is None:
+                continue
+            drawn = Drawing(repo, module, body, self.drawn_from)
+            found += [(name, reason, f"a drawing of {values}") for reason, _ in drawn.inputs()]
+            cuts = [f"a picture of more channels, {text_of(each)}" for each in drawn.cuts()]
+            found += [(name, each, "a picture") for each in cuts[:1]]
             returned = (each.value for each in every(body, ast.Return))
-            if body and any(isinstance(n, ast.Dict) and not pictures(n) for n in returned):
+            if any(isinstance(each, ast.Dict) and not pictures(each) for each in returned):
                 found.append((name, "it returns no render", "the picture under this name"))
         return [Finding.error("drawn-values", f"{module}:{name}", *each) for name, *each in found]
 

@@ -44,6 +44,8 @@ _ADDED = re.compile(r"bg_color|zeros_like\(\w+\)$|\* 0\.0$")
 """What is added to a picture and leaves its Gaussians alone: a background, or zeros."""
 _PICTURES = re.compile(r"mesh_\w+|(?!clamp|use)\w+_(rgb|colou?rs?)")
 """Arguments of a rasterizer that are pictures to blend with its own."""
+_BEHIND = re.compile(r"(bg|background)_depth\w*")
+"""What is given to a rasterizer that draws Gaussians in front of a picture alone."""
 _CHANNELS = re.compile(r"feat|sem|lang|obj|mask|label|normal")
 """In names of values that a rasterizer blends beside the colours."""
 _OTHERS = re.compile(r"^(?!num_|.*(depth|normal|alpha)).*(image|render|rgb|colou?r)")
@@ -307,7 +309,10 @@ class Drawing:
         yield from self.inputs()
         calls = read_calls(self.repo, self.module, self.function.name)
         names = dict.fromkeys([*self.arguments, *(n for each in calls for n in each.given)])
-        blended = [each for each in names if _PICTURES.fullmatch(each)] or [*self._of_columns()]
+        given = dict.fromkeys(text_of(value) for each in calls for value in each.given.values())
+        blended = [each for each in names if _PICTURES.fullmatch(each)]
+        blended += filter(_BEHIND.fullmatch, given)
+        blended = blended or [*self._of_columns()]
         if blended:
             yield f"its rasterizer also takes {', '.join(blended)}", False
         for each in calls:

@@ -19,6 +19,7 @@ from fragprune_graphdeco.reading import (
     module_of,
     options_of,
     own_imports,
+    texts_of,
 )
 from fragprune_graphdeco.syntax import (
     assigned,
@@ -50,7 +51,7 @@ def reasons(repo: HostRepo, scripts: tuple[str, ...]) -> tuple[str, ...]:
     saver = ModelClass(repo).saver
     if saver and saver.name != "save_ply" and ".save_ply(" not in text_of(saver):
         found.append(f"Scene.save writes its PLY by {saver.name}, which saves no thresholds")
-    found += [*_left_out(repo, scripts), *_of_scene(repo)][:1]
+    found += [*_left_out(repo, scripts), *_of_scene(repo), *_of_authors(repo)][:1]
     for script in scripts:
         module = module_of(script)
         tree, home = repo.tree(module), home_of(repo, module)
@@ -64,6 +65,7 @@ def reasons(repo: HostRepo, scripts: tuple[str, ...]) -> tuple[str, ...]:
         found += [*_broken(repo, module)][:1]
         found += [*_unbound(repo, module)][:1]
         found += (*_misfits(repo, module), *_absent(repo, module), *_own_options(repo, module))[:1]
+        found += [*_of_cameras(repo, module)][:1]
         found += [*_untyped(repo, module)][:1]
         found += [f"{script} draws by {each}" for each in _drawn_elsewhere(repo, module)][:1]
     return tuple(found)
@@ -226,6 +228,42 @@ def _of_scene(repo: HostRepo) -> Iterator[str]:
             yield f"its scene calls {name}, which GaussianModel lacks ({at})"
 
 
+def _of_authors(repo: HostRepo) -> Iterator[str]:
+    """Files that the scene loads by a path of its author's, whatever its command says."""
+    made = repo.function("scene", "Scene.__init__")
+    for node in getattr(made, "body", ()):
+        value = getattr(node.value, "value", "") if isinstance(node, ast.Assign) else ""
+        if re.fullmatch(r"(/|[A-Z]:)\S+\.\w+", str(value)):
+            yield f"its scene loads {value} ({repo.at('scene', node.lineno)})"
+
+
+_CAMERA = re.compile(r"viewpoint(_?cam(era)?)?")
+"""What scripts call a camera of their scene."""
+
+
+def _of_cameras(repo: HostRepo, module: str) -> Iterator[str]:
+    """Attributes that a script reads of its cameras, and that nothing sets but for cameras that
+    derive from those.
+    """
+    tree, camera = repo.tree(module), repo.definition("scene.cameras", "Camera")
+    bases = {text_of(each) for each in getattr(camera, "bases", ())}
+    made = "return Camera(" in text_of(repo.function("utils.camera_utils", "loadCam"))
+    if not made or bases - {"nn.Module", "torch.nn.Module", "object"}:
+        return
+    classes = every(repo.tree("scene.cameras"), ast.ClassDef)
+    alike = [each for each in classes if "Camera" not in map(text_of, each.bases)]
+    own = {text_of(node) for each in alike for node in every(each, ast.Attribute)}
+    own |= {f"self.{getattr(node, 'name', '')}" for each in alike for node in nodes(each)}
+    texts = "".join(map(repo.read, sorted(repo.root.glob("scene/*.py"))))
+    texts += "".join(texts_of(repo).values())
+    called = {each.func for each in every(tree, ast.Call)} | _perhaps(repo, module)
+    for node in (each for each in every(tree, ast.Attribute) if each not in called):
+        name, of_camera = node.attr, _CAMERA.fullmatch(getattr(node.value, "id", ""))
+        given = rf"(?<!self)\.{name}\b[^=(),\n]*=(?!=)|['\"]{name}['\"]"
+        if of_camera and f"self.{name}" not in own and not re.search(given, texts):
+            yield f"reads {name} of a camera, which has none ({repo.at(module, node.lineno)})"
+
+
 def _lengths(
     repo: HostRepo, module: str, owner: ast.AST | None, function: ast.AST | None
 ) -> set[int]:
@@ -326,15 +364,17 @@ def _started(body: Iterable[ast.stmt]) -> Iterator[ast.stmt]:
 
 
 def overruling(repo: HostRepo, module: str) -> frozenset[str]:
-    """Options, off by default, under which a script sets others whatever its command says."""
+    """Options, off by default, under which a script sets others, or their defaults."""
     tree, known = repo.tree(module), as_options(repo, ("arguments", module))
     imports = every(tree, ast.ImportFrom)
     homes = {each.name: repo.absolute(module, node) for node in imports for each in node.names}
     found = frozenset[str]()
     for node, test in skipped(tree, known).items():
-        name = getattr(getattr(node, "func", None), "id", "")
+        called = getattr(node, "func", None)
+        name = getattr(called, "id", "")
         made = repo.function(homes.get(name, module), name) if name else None
-        if name == "setattr" or (made and _sets_any(made, {})):
+        defaults = getattr(called, "attr", "") == "set_defaults"
+        if name == "setattr" or defaults or (made and _sets_any(made, {})):
             found |= options_of(test, known)
     return found
 

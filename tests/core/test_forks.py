@@ -658,8 +658,11 @@ def test_a_script_that_overrules_its_command_is_refused(tmp_path, what):
 
 def test_a_command_that_names_a_file_which_overrules_it_is_refused(tmp_path):
     by_merge = "if args.config:\n        args = overruled(args, read(args.config))"
-    for each, sets in enumerate(("args = asked(args, read)", by_merge)):
-        repo = overruled(tmp_path / str(each), sets)
+    asked = "\nparser.add_argument('--config', default='')\nearly, _ = parser.parse_known_args()\n"
+    asked += "if early.config:\n    parser.set_defaults(**read(early.config))\n"
+    by_default = fork(tmp_path / "defaults", (PARSES, asked + PARSES))
+    both = enumerate(("args = asked(args, read)", by_merge))
+    for repo in (by_default, *(overruled(tmp_path / str(each), sets) for each, sets in both)):
         ForkAdapter().refuse(repo, ["--iterations", "9"], stage="auto", device="cpu")
         with pytest.raises(UsageError, match="--config"):
             ForkAdapter().refuse(repo, ["--config", "a.json"], stage="auto", device="cpu")
@@ -1105,6 +1108,60 @@ def test_a_scene_that_calls_what_its_model_lacks_is_refused(tmp_path, under, cal
     made = f"def __init__(self, args, gaussians):\n        {under}\n            {called}\n"
     scene.write_text(scene.read_text().replace("def __init__(self, args, gaussians): ...\n", made))
     found = "its scene calls create_from_mesh, which GaussianModel lacks (scene/__init__.py:7)"
+    assert errors(repo) == [] if runs else found in str(errors(repo))
+
+
+@pytest.mark.parametrize(
+    ("path", "runs"), [("'/content/mine/start.ply'", False), ("args.start", True)]
+)
+def test_a_scene_that_loads_a_file_of_its_authors_is_refused(tmp_path, path, runs):
+    repo = fork(tmp_path)
+    scene = tmp_path / "scene/__init__.py"
+    made = f"def __init__(self, args, gaussians):\n        start = {path}\n        load(start)\n"
+    scene.write_text(scene.read_text().replace("def __init__(self, args, gaussians): ...\n", made))
+    assert ("its scene loads /content/mine/start.ply" in str(errors(repo))) == (not runs)
+
+
+CAMERA = """class Camera(nn.Module):
+    def __init__(self, image):
+        self.{}image = image
+
+    @property
+    def width(self): return 1
+
+
+class Posed(Camera):
+    def __init__(self, image):
+        self.turned = True
+
+
+class Raw(nn.Module):
+    def __init__(self, image):
+        self.raw = image
+"""
+
+
+@pytest.mark.parametrize(
+    ("read", "private", "runs"),
+    [
+        ("viewpoint_cam.image", "", True),
+        ("viewpoint_cam.image", "__", False),
+        ("viewpoint_cam.turned", "", False),
+        ("viewpoint_cam.turned if hasattr(viewpoint_cam, 'turned') else 0", "", True),
+        ("viewpoint_cam.width", "", True),
+        ("viewpoint_cam.raw", "", True),
+        ("viewpoint_cam.cpu()", "", True),
+        ("1\n        viewpoint_cam.seen = viewpoint_cam.seen + 1", "", True),
+    ],
+)
+def test_a_script_that_reads_what_its_cameras_lack_is_refused(tmp_path, read, private, runs):
+    pops = f"viewpoint_cam = views.pop()\n        shown = {read}\n        package = render("
+    repo = fork(tmp_path, ("package = render(", pops))
+    (tmp_path / "scene/cameras.py").write_text(CAMERA.format(private))
+    (tmp_path / "utils").mkdir(exist_ok=True)
+    (tmp_path / "utils/camera_utils.py").write_text("def loadCam(args):\n    return Camera(args)\n")
+    name = read.split(".")[-1]
+    found = f"reads {name} of a camera, which has none (train.py:"
     assert errors(repo) == [] if runs else found in str(errors(repo))
 
 

@@ -292,6 +292,11 @@ def test_the_nearest_host_is_of_this_family(fork):
         ("    opacity = pc.get_opacity\n", f"{ASKED}    pc.hidden = 0\n", "from pc.hidden"),
         (CALLED, MEAN, "its picture is made into image.mean(dim=0)"),
         ("shs=shs, scales", "mesh_color=mesh, shs=shs, scales", "rasterizer also takes mesh_color"),
+        (
+            "raster_settings=settings",
+            "raster_settings=GaussianRasterizationSettings(depth=bg_depth)",
+            "its rasterizer also takes bg_depth",
+        ),
         ("{'params': [], 'name': 'f_dc'}", "{'params': [self._opacity]}", "not train positions"),
         ("shs=shs, scales", "colors_precomp=torch.exp(rgb), shs=shs, scales", "torch.exp(rgb)"),
         *(

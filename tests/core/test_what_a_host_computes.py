@@ -293,10 +293,15 @@ def test_a_drawing_function_of_a_host_returns_its_picture_as_render(tmp_path):
     repo = skeleton(tmp_path)
     render = tmp_path / "gaussian_renderer/__init__.py"
     returns = '\n    return {{"{}": image, "radii": radii}}\n'.format
-    render.write_text(render.read_text().rstrip() + returns("render"))
+    drawn = render.read_text().rstrip().replace("value0", "image")
+    render.write_text(drawn + returns("render"))
     assert not errors(repo)
-    edit(render, '"render"', '"foreground"')
-    assert "returns no render" in errors(HostRepo(tmp_path))[0]
+    for old, new, says in (
+        ('"render": image', '"render": image[:3]', "a picture of more channels, image[:3]"),
+        ('"render": image[:3]', '"foreground": image', "returns no render"),
+    ):
+        edit(render, old, new)
+        assert says in errors(HostRepo(tmp_path))[0]
 
 
 @pytest.mark.parametrize(
