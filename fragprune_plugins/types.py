@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import MISSING, dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 from fragprune_plugins.constants import (
     ALPHA_MAX,
@@ -345,6 +345,7 @@ class Footprints:
     colors: Tensor
     tiles: Tensor
     features: Tensor | None = None
+    flat: ClassVar[bool] = False  # none is a surfel
 
     __repr__ = one_line
 
@@ -456,11 +457,10 @@ class RasterInputs:
 
     def _check_surfels(self) -> None:
         """Raise InputError if surfels come with what their rasterizer does not know."""
-        splats = self.splats
-        if not (isinstance(splats, Splats) and splats.flat):
+        if not self.splats.flat:
             return
         given = {
-            "features": splats.features is not None,
+            "features": self.splats.features is not None,
             "compensation": self.compensation != "none",
             "sample_offsets": self.sample_offsets is not None,
             "absolute_gradient": self.absolute_gradient,

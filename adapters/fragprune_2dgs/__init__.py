@@ -69,7 +69,7 @@ class SurfelSplatting(GraphdecoAdapter):
         states="July 2025",
         limits=(
             "A GPU cannot draw with thresholds: stage 2 needs --device cpu.",
-            "fragprune finetune, render, export and view have no surfels: they refuse its PLY.",
+            "fragprune finetune, view, export and audit have no surfels: they refuse its PLY.",
             "--portable and --compute_cov3D_python are refused.",
         ),
     )

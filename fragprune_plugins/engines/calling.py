@@ -98,7 +98,7 @@ def native_inputs(
         sh_coefficients=sum(_second_length(arrays.get(name)) for name in ("sh", "sh_rest")),
         feature_count=_second_length(arrays.get("features")),
         widen=widen,
-        flat=isinstance(splats, Splats) and splats.flat,
+        flat=splats.flat,
         soft=inputs.rim == "soft",
         count=len(splats),
         lengths=binding.Lengths(**{name: array.numel() for name, array in arrays.items()}),

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.constants import NEUTRAL_LOGIT
-from fragprune_plugins.errors import AlignmentError, SessionError, UsageError, log
+from fragprune_plugins.errors import AlignmentError, InputError, SessionError, UsageError, log
 from fragprune_plugins.hosts.dialect import HostCall
 from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
 from fragprune_plugins.injection.proofs import proved
@@ -224,10 +224,17 @@ def directly(device: torch.device) -> Iterator[None]:
 
 
 def unpack(session: SessionState, call: HostCall) -> tuple[RasterInputs, Draw]:
-    """Translate the host's call into ``RasterInputs``, and choose what draws on its device."""
+    """Translate the host's call into ``RasterInputs``, and choose what draws on its device.
+
+    Raises:
+        InputError: surfels for a portable goal, in stage 1 already.
+    """
     engine, rendering = session.engine(call[session.dialect.means].device), session.rendering.get()
     still = rendering is not None and session.standing_still(rendering[0])
     inputs = session.dialect.unpack(replace(call, engine=engine, still=still))
+    if session.settings.goal.on_area and inputs.splats.flat:
+        found = "surfels (2 scales each), which viewers of 3D Gaussians do not draw"
+        raise InputError("portable", found, "3D Gaussians", "Leave --portable out.")
     return inputs, partial(drawn_by, engine)
 
 

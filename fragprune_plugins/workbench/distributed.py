@@ -217,7 +217,7 @@ def _expect_sendable(inputs: RasterInputs) -> Splats:
     splats = inputs.splats
     given = {
         "Footprints": not isinstance(splats, Splats),
-        "surfels": isinstance(splats, Splats) and splats.flat,
+        "surfels": splats.flat,
         "features": splats.features is not None,
         "means2d_hook": inputs.means2d_hook is not None,
         "sample_offsets": inputs.sample_offsets is not None,

@@ -106,10 +106,9 @@ def test_compare_draws_its_models_by_a_record_of_the_host(trained, first):
     assert found["b"]["fragments_per_pixel"] < found["a"]["fragments_per_pixel"]
 
 
-def test_portable_is_refused(mini, photographs, trained, tmp_path):
-    _, words, _ = trained
-    options = RunOptions(
-        device="cpu", stage="finetune", settings=Settings(iterations=8, goal=Portable()), again=True
-    )
+def test_portable_is_refused_before_the_training(mini, photographs, tmp_path):
+    words = command(mini / "train.py", photographs, tmp_path / "out", 20)
+    options = RunOptions(device="cpu", settings=Settings(iterations=8, goal=Portable()))
     with pytest.raises(InputError, match="surfels"):
         run(words, options)
+    assert not any(tmp_path.glob("out/chkpnt*"))

@@ -22,7 +22,7 @@ from fragprune_plugins.engines.calling import (
     with_gradients,
 )
 from fragprune_plugins.engines.cpu import binding
-from fragprune_plugins.types import RasterInputs, RasterOutputs, Splats
+from fragprune_plugins.types import RasterInputs, RasterOutputs
 
 _STAGES = ("projection", "binning", "blend")
 
@@ -44,7 +44,7 @@ class _Drawing:
         """Run the forward pass."""
         view, splats, fresh = self.inputs.view, self.inputs.splats, partial(empty, self.workspace)
         drawn = new_outputs(self.inputs, fresh, self.inputs.planes)
-        if isinstance(splats, Splats) and splats.flat and "surface" in self.inputs.planes:
+        if splats.flat and "surface" in self.inputs.planes:
             drawn["surface"] = fresh(6, view.height, view.width)
         if self.inputs.scores:
             drawn["weights_per_gaussian"] = fresh(len(splats))

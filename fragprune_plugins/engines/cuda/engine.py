@@ -49,7 +49,7 @@ class CudaEngine:
             EngineError: they are surfels, for which there are no kernels.
         """
         inputs.check_thresholds(thresholds)
-        if isinstance(inputs.splats, Splats) and inputs.splats.flat:
+        if inputs.splats.flat:
             expected = "3D Gaussians: there are no kernels for surfels"
             remedy = "Run on the CPU (--device cpu), or draw it small with --engine reference."
             raise EngineError("engine 'cuda'", "surfels (2 scales each)", expected, remedy)
