@@ -261,11 +261,13 @@ class ThresholdStore:
         """Keep, copy and append rows at once: row i takes the values of row ``origins[i]``.
 
         Args:
-            origins: (M,) int64, for each of the M new rows the old row it descends from.
+            origins: (M,) int64, for each of the M new rows the old one it descends from, or -1.
             fresh: (M,) bool, True where the row is a new Gaussian: its moments are zero.
         """
-        origins = self._rows(origins, len(fresh), "rearrange")
+        origins = self._rows(origins, len(fresh), "rearrange", least=-1)
         self._resize(lambda rows: rows[origins])
+        with torch.no_grad():
+            self.logits[origins < 0] = NEUTRAL_LOGIT
         for name in MOMENTS.keys() & self.adam:
             self.adam[name][fresh] = 0
 
@@ -358,8 +360,8 @@ def copies(known: Sequence[Tensor], new: Sequence[Tensor]) -> Tensor:
     A row is the values at its place in all tensors, (N, ...) of those that are known, (M, ...) of
     the new ones.
     """
-    tables = [torch.cat([each.detach().flatten(1) for each in rows], 1) for rows in (known, new)]
-    bits = torch.cat(tables).float().view(torch.int32)
+    tables = ([each.detach()[..., None].flatten(1) for each in rows] for rows in (known, new))
+    bits = torch.cat([torch.cat(each, 1) for each in tables]).float().view(torch.int32)
     kinds: Tensor = torch.unique(bits, dim=0, return_inverse=True)[1]
     first = kinds.new_full((len(bits),), -1)
     numbers = torch.arange(len(known[0]), device=first.device)
