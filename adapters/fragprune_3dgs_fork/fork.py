@@ -47,6 +47,7 @@ class Fork:
     outputs: dict[str, tuple[Output, ...]] = field(default_factory=dict)  # by rasterizer's package
     still: tuple[str, ...] = ()  # methods of the model that scripts call, and that change it
     answering: frozenset[str] = frozenset()  # those whose result they read, while they densify
+    relocating: frozenset[str] = frozenset()  # those that overwrite rows by copies of others
     setups: tuple[str, ...] = ()  # methods that make the optimizer
     # by package, the argument with channels that are blended beside the colours
     blended: dict[str, str] = field(default_factory=dict)

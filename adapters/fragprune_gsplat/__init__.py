@@ -40,6 +40,7 @@ PACKAGE = "gsplat"
 RENDERING, OPERATIONS = f"{PACKAGE}.rendering", f"{PACKAGE}.strategy.ops"
 EXPORTER = f"{PACKAGE}.exporter"
 BASE = f"{PACKAGE}.strategy.base"
+REARRANGING = ("duplicate", "split", "remove", "relocate", "sample_add")
 RELOCATED = ("opacities", "scales", "ratios", "binoms")
 SHAPED = ("quats", "scales", "compute_covar", "compute_preci", "triu")
 DEFAULT, MCMC = f"{PACKAGE}.strategy.default", f"{PACKAGE}.strategy.mcmc"
@@ -114,10 +115,6 @@ def read_again(call: SeamCall) -> tuple[Path, Tensor] | None:
     return (Path(file), splats["means"].detach().cpu()) if splats and file else None
 
 
-def _operation(name: str, *needs: str) -> Seam:
-    return Seam(Role.REARRANGE, OPERATIONS, name, ("params", "optimizers", *needs))
-
-
 class Gsplat(HostAdapter):
     """The adapter of gsplat."""
 
@@ -143,11 +140,7 @@ class Gsplat(HostAdapter):
         Seam(Role.VIEW, RENDERING, "rasterization_2dgs", ("viewmats",), how=surfels),
         Seam(Role.LOSS, "torch", "Tensor.backward", external=True),
         Seam(Role.ATTACH, BASE, "Strategy.check_sanity", ("params", "optimizers"), how=optimizers),
-        _operation("duplicate", "mask"),
-        _operation("split", "mask"),
-        _operation("remove", "mask"),
-        _operation("relocate", "mask"),
-        _operation("sample_add", "n"),
+        *(Seam(Role.REARRANGE, OPERATIONS, name, ("params",)) for name in REARRANGING),
         Seam(Role.STILL, OPERATIONS, "reset_opa", ("params",)),
         Seam(Role.STILL, OPERATIONS, "inject_noise_to_position", ("params",)),
         Seam(Role.STILL, DEFAULT, "DefaultStrategy.step_pre_backward", ("params",)),
