@@ -9,7 +9,7 @@ from functools import partial
 
 import fragprune_graphdeco as graphdeco
 from fragprune_3dgs_fork import rasterizer
-from fragprune_3dgs_fork.fork import CAMERA, MODEL, RENDERER, Draw, Fork, mentioned, method_calls
+from fragprune_3dgs_fork.fork import CAMERA, MODEL, RENDERER, Draw, Fork, method_calls
 from fragprune_3dgs_fork.rasterizer import Output
 from fragprune_graphdeco import (
     Drawing,
@@ -23,6 +23,7 @@ from fragprune_graphdeco import (
     syntax,
     text_of,
 )
+from fragprune_graphdeco.syntax import mentioned
 from fragprune_plugins.adapting import nodes
 
 _MODEL_ARGUMENTS = ("pc", "gaussians", "gaussian", "model")

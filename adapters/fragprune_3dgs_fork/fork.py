@@ -173,17 +173,6 @@ def while_densifying(tree: ast.AST) -> Collection[ast.AST]:
     return under(tree, "densify_until_iter").keys() | first
 
 
-@lru_cache(maxsize=256)
-def mentioned(tree: ast.AST) -> frozenset[str]:
-    """Names, attributes and imports in a tree."""
-    return frozenset(
-        getattr(node, kind)
-        for node in nodes(tree)
-        for kind in ("id", "attr", "name")
-        if isinstance(getattr(node, kind, None), str)
-    )
-
-
 def method_calls(tree: ast.AST) -> Iterator[tuple[ast.Call, str]]:
     """Calls of methods, with the methods' names."""
     for node in every(tree, ast.Call):

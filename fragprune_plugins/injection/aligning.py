@@ -20,8 +20,7 @@ def on_append(session: SessionState, call: SeamCall) -> Any:
         return call.run()
     new, parents = call.first, None
     if copied := _copied(session, new) if not state.store.neutral else []:
-        own = {name: group["params"][0] for name, group in session.groups(call.model)}
-        parents = copies(_copied(session, own), copied)
+        parents = copies(_copied(session, _rows(session, call)), copied)
     result = call.run()
     with session.changing(state.store, "append"):
         state.store.append(len(next(iter(new.values()))), parents)
@@ -50,15 +49,15 @@ def on_rearrange(session: SessionState, call: SeamCall) -> Any:
     state = session.models.get(call.model)
     if state is None:
         return call.run()
-    before, result = _rows(session, call), call.run()
+    before, result, after = _rows(session, call), call.run(), _rows(session, call)
+    if all(map(torch.equal, before.values(), after.values())):
+        return result  # the gradients of this step are still to be used
     with session.changing(state.store, "rearrange"):
         if state.store.neutral:
             state.store.replace(len(session.adapter.means(call.model)))
         else:
-            after = _rows(session, call)
             parents = copies(_copied(session, before), _copied(session, after))
-            was, now = [*before.values()], [*after.values()]
-            same, first = copies(was, now), copies(now, now)
+            same, first = (copies([*e.values()], [*after.values()]) for e in (before, after))
             fresh = (same < 0) | (first < torch.arange(len(first), device=first.device))
             state.store.rearrange(torch.where(same < 0, parents, same), fresh)
     state.views.clear()  # their calls may hold tensors of the old rows

@@ -78,7 +78,6 @@ def rearranged(session, model, rows, moved=()):
 
 
 ARRANGED = {
-    "nothing": (range(6), (), "......"),
     "kept elsewhere": ((4, 0, 2), (), "..."),
     "cloned": ((0, 1, 2, 3, 4, 5, 4), (), "......n"),
     "split: both children are moved": ((0, 1, 2, 3, 5, 4, 4), (5, 6), ".....nn"),
@@ -96,6 +95,14 @@ def test_thresholds_follow_their_rows_to_new_places_and_observers_are_told(sessi
     assert torch.equal(known.store.logits, LOGITS[origins])
     assert torch.equal(known.store.adam["exp_avg"], torch.where(new, 0.0, 1.0 + origins))
     assert told(session) == [("rearrange", 6, len(rows))]
+
+
+def test_an_operation_that_did_nothing_changes_nothing(session):
+    model, known = follow(session)
+    known.views[3], before = print, known.store.logits
+    assert rearranged(session, model, torch.arange(6)) == "rearranged"
+    assert known.store.logits is before  # with its gradient
+    assert (list(known.views), told(session)) == ([3], [])
 
 
 def test_of_neutral_thresholds_only_the_number_is_followed(session):
