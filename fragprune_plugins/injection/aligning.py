@@ -50,17 +50,16 @@ def on_rearrange(session: SessionState, call: SeamCall) -> Any:
     if state is None:
         return call.run()
     before, result, after = _rows(session, call), call.run(), _rows(session, call)
-    if all(map(torch.equal, before.values(), after.values())):
-        return result  # the gradients of this step are still to be used
-    with session.changing(state.store, "rearrange"):
-        if state.store.neutral:
-            state.store.replace(len(session.adapter.means(call.model)))
-        else:
-            parents = copies(_copied(session, before), _copied(session, after))
-            same, first = (copies([*e.values()], [*after.values()]) for e in (before, after))
-            fresh = (same < 0) | (first < torch.arange(len(first), device=first.device))
-            state.store.rearrange(torch.where(same < 0, parents, same), fresh)
-    state.views.clear()  # their calls may hold tensors of the old rows
+    if not all(map(torch.equal, before.values(), after.values())):  # else gradients stay to be used
+        with session.changing(state.store, "rearrange"):
+            if state.store.neutral:
+                state.store.replace(len(session.adapter.means(call.model)))
+            else:
+                parents = copies(_copied(session, before), _copied(session, after))
+                same, now = (copies([*e.values()], [*after.values()]) for e in (before, after))
+                fresh = (same < 0) | (now < torch.arange(len(now), device=now.device))
+                state.store.rearrange(torch.where(same < 0, parents, same), fresh)
+        state.views.clear()  # their calls may hold tensors of the old rows
     session.expect_rows(call.model, state, str(call.seam))
     return result
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from core.sessions import Model, Role, call, follow, state
 
-from fragprune_plugins.adapting import ParamGroup
+from fragprune_plugins.adapting import AlignmentError, ParamGroup
 from fragprune_plugins.injection.session import OF_MODELS
 from fragprune_plugins.learning.thresholds import NEUTRAL_LOGIT
 
@@ -103,6 +103,13 @@ def test_an_operation_that_did_nothing_changes_nothing(session):
     assert rearranged(session, model, torch.arange(6)) == "rearranged"
     assert known.store.logits is before  # with its gradient
     assert (list(known.views), told(session)) == ([3], [])
+
+
+def test_rows_that_no_known_optimizer_has_are_not_lost_silently(session):
+    model, _ = follow(session)
+    session.optimizers[model] = []
+    with pytest.raises(AlignmentError, match="host:f: 3 Gaussians"):
+        rearranged(session, model, torch.arange(3))
 
 
 def test_of_neutral_thresholds_only_the_number_is_followed(session):
