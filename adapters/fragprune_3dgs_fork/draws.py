@@ -18,12 +18,12 @@ from fragprune_graphdeco import (
     every,
     is_off,
     kernels,
+    mentioned,
     off_by_default,
     reading,
     syntax,
     text_of,
 )
-from fragprune_graphdeco.syntax import mentioned
 from fragprune_plugins.adapting import nodes
 
 _MODEL_ARGUMENTS = ("pc", "gaussians", "gaussian", "model")

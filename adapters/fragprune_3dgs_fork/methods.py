@@ -17,8 +17,7 @@ from fragprune_3dgs_fork.fork import (
     methods_of,
     while_densifying,
 )
-from fragprune_graphdeco import assigned, every, is_off, reading, text_of
-from fragprune_graphdeco.syntax import mentioned
+from fragprune_graphdeco import assigned, every, is_off, mentioned, reading, text_of
 from fragprune_plugins.adapting import Finding, HostRepo
 
 PARAMETERS = {"_xyz", "_features_dc", "_features_rest", "_opacity", "_scaling", "_rotation"}

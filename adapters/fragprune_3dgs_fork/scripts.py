@@ -20,8 +20,7 @@ from fragprune_3dgs_fork.fork import (
     methods_of,
     under,
 )
-from fragprune_graphdeco import every, failing, is_off, reading, syntax, text_of
-from fragprune_graphdeco.syntax import mentioned
+from fragprune_graphdeco import every, failing, is_off, mentioned, reading, syntax, text_of
 from fragprune_plugins.adapting import HostRepo, nodes
 
 _CHECKPOINT = re.compile(
