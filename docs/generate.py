@@ -42,7 +42,7 @@ the first answer counts, `None` leaves the answer to the next plugin. Our own an
 
 def roles() -> str:
     """What happens at a seam."""
-    from fragprune_plugins.hosts.seams import Role, RowTrace, Seam, SeamCall
+    from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
 
     intro = """A *seam* is one function of a host that is wrapped while fragprune is active. An
 adapter lists a host's seams and gives each a role. In most roles the host's function runs
@@ -56,7 +56,7 @@ Brackets show the default of a seam without a `how`. Without brackets a `how` is
     cells = [(role.name, _sentence(role.does), role.how and _sentence(role.how)) for role in Role]
     rows = "\n".join(f"| `{name}` | {does} | {_fields(how)} |" for name, does, how in cells)
     table = f"| role | what fragprune does there | `how` |\n|---|---|---|\n{rows}"
-    kinds = map(_class, (Seam, SeamCall, RowTrace))
+    kinds = map(_class, (Seam, SeamCall))
     return _page("Roles of seams", intro, table, *kinds)
 
 

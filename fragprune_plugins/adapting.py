@@ -3,7 +3,7 @@
 a host      HostAdapter, or ScriptAdapter where it has training scripts; HostInfo, HostRepo,
             ParamGroup and those of 3DGS (GROUPS), Finding
 its source  nodes, imported of what HostRepo reads; Plain, change_of
-its seams   Seam, Role, SeamCall, RowTrace, revised
+its seams   Seam, Role, SeamCall, revised
 drawing     Dialect, HostCall; RasterInputs and its parts, RasterOutputs
 a proof     Prover, Proof, Place
 its script  CommandLine, ConfigFile, Photographs, Resolution
@@ -60,7 +60,6 @@ from fragprune_plugins.hosts.photographs import WIDEST as WIDEST
 from fragprune_plugins.hosts.photographs import Photographs as Photographs
 from fragprune_plugins.hosts.photographs import Resolution as Resolution
 from fragprune_plugins.hosts.seams import Role as Role
-from fragprune_plugins.hosts.seams import RowTrace as RowTrace
 from fragprune_plugins.hosts.seams import Seam as Seam
 from fragprune_plugins.hosts.seams import SeamCall as SeamCall
 from fragprune_plugins.hosts.seams import revised as revised

@@ -338,7 +338,9 @@ class ForkAdapter(GraphdecoAdapter):
             *(
                 of(Role.STILL, each, no_result if each in fork.answering else None)
                 for each in fork.still
+                if each not in fork.relocating
             ),
+            *(of(Role.REARRANGE, each) for each in fork.still if each in fork.relocating),
             of(Role.SAVE, "save_ply"),
             of(Role.LOAD, "load_ply"),
             *(() if fork.one_run else (of(Role.CAPTURE, "capture"), of(Role.RESTORE, "restore"))),

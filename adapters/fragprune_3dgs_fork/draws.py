@@ -9,7 +9,7 @@ from functools import partial
 
 import fragprune_graphdeco as graphdeco
 from fragprune_3dgs_fork import rasterizer
-from fragprune_3dgs_fork.fork import CAMERA, MODEL, RENDERER, Draw, Fork, mentioned, method_calls
+from fragprune_3dgs_fork.fork import CAMERA, MODEL, RENDERER, Draw, Fork, method_calls
 from fragprune_3dgs_fork.rasterizer import Output
 from fragprune_graphdeco import (
     Drawing,
@@ -18,6 +18,7 @@ from fragprune_graphdeco import (
     every,
     is_off,
     kernels,
+    mentioned,
     off_by_default,
     reading,
     syntax,

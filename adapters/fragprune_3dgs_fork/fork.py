@@ -47,6 +47,7 @@ class Fork:
     outputs: dict[str, tuple[Output, ...]] = field(default_factory=dict)  # by rasterizer's package
     still: tuple[str, ...] = ()  # methods of the model that scripts call, and that change it
     answering: frozenset[str] = frozenset()  # those whose result they read, while they densify
+    relocating: frozenset[str] = frozenset()  # those that overwrite rows by copies of others
     setups: tuple[str, ...] = ()  # methods that make the optimizer
     # by package, the argument with channels that are blended beside the colours
     blended: dict[str, str] = field(default_factory=dict)
@@ -170,17 +171,6 @@ def while_densifying(tree: ast.AST) -> Collection[ast.AST]:
     new = (each.orelse for each in every(tree, ast.If) if _RESUMES.search(text_of(each.test)))
     first = {inner for part in new for each in part for inner in nodes(each)}
     return under(tree, "densify_until_iter").keys() | first
-
-
-@lru_cache(maxsize=256)
-def mentioned(tree: ast.AST) -> frozenset[str]:
-    """Names, attributes and imports in a tree."""
-    return frozenset(
-        getattr(node, kind)
-        for node in nodes(tree)
-        for kind in ("id", "attr", "name")
-        if isinstance(getattr(node, kind, None), str)
-    )
 
 
 def method_calls(tree: ast.AST) -> Iterator[tuple[ast.Call, str]]:

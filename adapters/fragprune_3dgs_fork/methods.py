@@ -13,17 +13,18 @@ from fragprune_3dgs_fork.fork import (
     MODEL,
     RENDERER,
     Fork,
-    mentioned,
     method_calls,
     methods_of,
     while_densifying,
 )
-from fragprune_graphdeco import assigned, every, is_off, reading, text_of
+from fragprune_graphdeco import assigned, every, is_off, mentioned, reading, text_of
 from fragprune_plugins.adapting import Finding, HostRepo
 
 PARAMETERS = {"_xyz", "_features_dc", "_features_rest", "_opacity", "_scaling", "_rotation"}
 PRIMITIVES = {"_prune_optimizer", "cat_tensors_to_optimizer", "replace_tensor_to_optimizer"}
 """Methods that change rows or values of parameters inside the optimizer."""
+RELOCATES = "replace_tensors_to_optimizer"
+"""By which 3DGS-MCMC's methods that overwrite rows end."""
 STATISTICS = {"oneupSHdegree", "add_densification_stats"}
 _MAKES = re.compile(r"__init__|capture\w*|(restore|create|load|init|set)_?\w*|\w*setup\w*")
 """Methods that make a model, before it is trained."""
@@ -81,6 +82,7 @@ def read_methods(fork: Fork) -> None:
                 at = fork.repo.at(module, node.lineno)
                 fork.refuse("row-change", at, f"reads what {name} returns", "a statement")
     fork.still = tuple(name for name in methods if name in still)
+    fork.relocating = frozenset(name for name in still if RELOCATES in called.get(name, ()))
     save = methods.get("save_ply", ast.Pass())
     steps = {name for node, name in method_calls(save) if text_of(node.func) == f"self.{name}"}
     if steps & changing or any(_assigned(save, "self")):

@@ -16,12 +16,11 @@ from fragprune_3dgs_fork.fork import (
     MODEL,
     RENDERER,
     Fork,
-    mentioned,
     method_calls,
     methods_of,
     under,
 )
-from fragprune_graphdeco import every, failing, is_off, reading, syntax, text_of
+from fragprune_graphdeco import every, failing, is_off, mentioned, reading, syntax, text_of
 from fragprune_plugins.adapting import HostRepo, nodes
 
 _CHECKPOINT = re.compile(

@@ -7,23 +7,15 @@ outside the PLY. Our readers refuse them; the host's own scripts draw them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from fragprune_graphdeco import GraphdecoAdapter, model_seam
-from fragprune_plugins.adapting import (
-    HostInfo,
-    ParamGroup,
-    Role,
-    RowTrace,
-    SeamCall,
-    UsageError,
-    revised,
-)
+from fragprune_plugins.adapting import HostInfo, ParamGroup, Role, SeamCall, UsageError, revised
 
+SORTED = ("xyz", "opacity", "scaling", "rotation")
 NETWORK = "network"  # our name for the param group of hash grid and colour network
 PP = "_pp.npz"  # ends the name of a file whose attributes are coded further
 
@@ -40,19 +32,9 @@ def most_compressed(call: SeamCall) -> Path:
     return next((file for file in files if file.is_file()), files[-1])
 
 
-@contextmanager
-def tracing(call: SeamCall) -> Iterator[RowTrace]:
-    """Find the rows again that sorting moves: it changes no value."""
-    import torch
-
-    from fragprune_plugins.adapting import copies
-
-    model, trace = call.model, RowTrace()
-    names = ("_xyz", "_opacity", "_scaling", "_rotation")
-    before = [getattr(model, name).detach().clone() for name in names]
-    yield trace
-    trace.origins = copies(before, [getattr(model, name) for name in names])
-    trace.fresh = torch.zeros_like(trace.origins, dtype=torch.bool)
+def rows(call: SeamCall) -> dict[str, Any]:
+    """What sorting moves: the model's own values, and its optimizer keeps the former ones."""
+    return {name: getattr(call.model, f"_{name}") for name in SORTED}
 
 
 class Compact3DGS(GraphdecoAdapter):
@@ -95,7 +77,7 @@ class Compact3DGS(GraphdecoAdapter):
         model_seam(Role.SAVE, "save_npz", "path", how=partial(ended, by=".npz")),
         model_seam(Role.SAVE, "save_npz_pp", "path", how=partial(ended, by=PP)),
         model_seam(Role.STILL, "mask_prune"),
-        model_seam(Role.REARRANGE, "sort_morton", how=tracing),
+        model_seam(Role.REARRANGE, "sort_morton", how=rows),
     )
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:

@@ -9,15 +9,13 @@ counts its steps from 0 again.
 from __future__ import annotations
 
 from argparse import ArgumentParser
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
-from typing import TYPE_CHECKING, Any, NoReturn
+from types import ModuleType
+from typing import Any, NoReturn
 
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall, rasterizer_seam
 from fragprune_plugins.adapting import (
-    AlignmentError,
     CommandLine,
     EngineError,
     Finding,
@@ -27,14 +25,10 @@ from fragprune_plugins.adapting import (
     HostRepo,
     NotComparedError,
     Role,
-    RowTrace,
     Seam,
     SeamCall,
     SessionError,
 )
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 PACKAGE, MCMC, REDUCED = "gaussian_splatting", "gaussian_splatting_mcmc", "reduced_3dgs"
 MODEL, TRAINER = f"{PACKAGE}.gaussian_model", f"{PACKAGE}.trainer"
@@ -94,40 +88,6 @@ def step_alone(call: SeamCall) -> Any:
     return call.instance.base_trainer.optim_step()
 
 
-@contextmanager
-def tracing(call: SeamCall) -> Iterator[RowTrace]:
-    """Store row numbers as one more coefficient of the colour, which densifiers only copy.
-
-    The column holds the bits of integers, so every row number is exact.
-    """
-    import torch
-
-    trainer, model, trace = call.instance, call.model, RowTrace()
-    densifier, colour = trainer.densifier, model._features_dc
-    numbers = torch.arange(len(colour), dtype=torch.int32, device=colour.device)
-    rider = numbers.view(torch.float32)[:, None, None].expand(-1, 1, colour.shape[2])
-
-    def noting(*args: Any, **kwargs: Any) -> Any:
-        model._features_dc = torch.nn.Parameter(torch.cat([colour.detach(), rider], dim=1))
-        try:
-            instruct = densifier.densify_and_prune(*args, **kwargs)
-        finally:
-            model._features_dc = colour
-        if any(each is not None for each in vars(instruct).values()):
-            trace.origins, trace.fresh = _follow(instruct, numbers)
-        return instruct._replace(
-            new_features_dc=_without_rider(instruct.new_features_dc),
-            replace_features_dc=_without_rider(instruct.replace_features_dc),
-        )
-
-    hook = densifier.after_densify_and_prune_hook
-    trainer.densifier = SimpleNamespace(densify_and_prune=noting, after_densify_and_prune_hook=hook)
-    try:
-        yield trace
-    finally:
-        trainer.densifier = densifier
-
-
 class GaussianSplatting(GraphdecoAdapter):
     """The pip package gaussian-splatting, with gaussian-splatting-mcmc."""
 
@@ -154,7 +114,7 @@ class GaussianSplatting(GraphdecoAdapter):
         rasterizer_seam(RASTERIZER),
         Seam(Role.LOSS, "torch", "Tensor.backward", external=True),
         Seam(Role.METRIC, f"{PACKAGE}.utils.lpipsPyTorch", "lpips"),
-        Seam(Role.REARRANGE, *DENSIFY, ("loss", "out", "camera"), how=tracing),
+        Seam(Role.REARRANGE, *DENSIFY, ("loss", "out", "camera")),
         Seam(Role.STILL, f"{TRAINER}.opacity_reset", "OpacityResetter.optim_step", how=step_alone),
         Seam(Role.STILL, f"{TRAINER}.sh_lift", "SHLifter.oneupSHdegree"),
         Seam(Role.SAVE, MODEL, "GaussianModel.save_ply", ("path",)),
@@ -216,33 +176,3 @@ class GaussianSplatting(GraphdecoAdapter):
     def view(self, camera: Any) -> int:
         """A key of the camera: its matrix. Cameras are tuples, which hosts copy."""
         return id(camera.world_view_transform)
-
-
-def _without_rider(colour: Tensor | None) -> Tensor | None:
-    return None if colour is None else colour[:, :1].contiguous()
-
-
-def _follow(instruct: Any, numbers: Tensor) -> tuple[Tensor, Tensor]:
-    """The origins of rows (N,) int32 after an instruction, and which are new or overwritten."""
-    import torch
-
-    def carried(colour: Tensor) -> Tensor:
-        return colour[:, 1, 0].contiguous().view(torch.int32)
-
-    origins, fresh = numbers.clone(), torch.zeros_like(numbers, dtype=torch.bool)
-    if instruct.replace_features_dc_mask is not None:
-        origins[instruct.replace_features_dc_mask] = carried(instruct.replace_features_dc)
-    if instruct.replace_scaling_mask is not None:  # first children, the relocated, their parents
-        fresh |= instruct.replace_scaling_mask
-    if instruct.remove_mask is not None:
-        origins, fresh = origins[~instruct.remove_mask], fresh[~instruct.remove_mask]
-    if instruct.new_features_dc is not None:
-        if instruct.new_features_dc.shape[1] != 2:
-            where = "DensificationInstruct.new_features_dc"
-            found = "rows that are not copies of the model's"
-            expected = "colours taken from the model by row"
-            raise AlignmentError(where, found, expected, "Use one of the package's own densifiers.")
-        added = carried(instruct.new_features_dc)
-        origins = torch.cat([origins, added])
-        fresh = torch.cat([fresh, torch.ones_like(added, dtype=torch.bool)])
-    return origins.long(), fresh

@@ -46,6 +46,7 @@ from fragprune_graphdeco.plain import read_models
 from fragprune_graphdeco.syntax import assigned as assigned
 from fragprune_graphdeco.syntax import every as every
 from fragprune_graphdeco.syntax import is_off as is_off
+from fragprune_graphdeco.syntax import mentioned as mentioned
 from fragprune_graphdeco.syntax import off_by_default as off_by_default
 from fragprune_graphdeco.syntax import text_of as text_of
 from fragprune_plugins.adapting import HostRepo, Plain, hookimpl

@@ -18,6 +18,7 @@ from fragprune_graphdeco.syntax import (
     decided,
     every,
     is_off,
+    mentioned,
     skipped,
     text_of,
 )
@@ -48,16 +49,9 @@ _ASKED = re.compile(r"self\.(\w+) is not None")
 _OTHER_FLAGS = ("hydra", "omegaconf", "tyro", "jsonargparse", "fire", "gin", "click", "absl")
 
 
-@lru_cache(maxsize=256)
-def _identifiers(tree: ast.Module | None) -> frozenset[Any]:
-    """Every name, attribute, definition and parameter in a tree."""
-    kinds = ("id", "attr", "name", "arg")
-    return frozenset(getattr(node, kind, None) for node in nodes(tree) for kind in kinds)
-
-
 def mentions(repo: HostRepo, modules: Iterable[str], names: Iterable[str]) -> set[str]:
     """Which of the names occur as identifiers, attributes or parameters."""
-    return set(names) & frozenset().union(*(_identifiers(repo.tree(each)) for each in modules))
+    return set(names) & frozenset().union(*(mentioned(repo.tree(each)) for each in modules))
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,13 @@ def _every(tree: ast.AST | None, kinds: tuple[type[Node], ...]) -> tuple[Node, .
     return tuple(each for each in nodes(tree) if isinstance(each, kinds))
 
 
+@lru_cache(maxsize=1024)
+def mentioned(tree: ast.AST | None) -> frozenset[Any]:
+    """Every name, attribute, definition and parameter in a tree."""
+    kinds = ("id", "attr", "name", "arg")
+    return frozenset(getattr(node, kind, None) for node in nodes(tree) for kind in kinds)
+
+
 def off_by_default(function: Function) -> set[str]:
     """Parameters that are None or False by default."""
     a = function.args

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Hashable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Hashable, Mapping
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
@@ -25,7 +24,6 @@ from fragprune_plugins.adapting import (
     InputError,
     ParamGroup,
     Role,
-    RowTrace,
     ScriptAdapter,
     Seam,
     SeamCall,
@@ -42,6 +40,7 @@ PACKAGE = "gsplat"
 RENDERING, OPERATIONS = f"{PACKAGE}.rendering", f"{PACKAGE}.strategy.ops"
 EXPORTER = f"{PACKAGE}.exporter"
 BASE = f"{PACKAGE}.strategy.base"
+REARRANGING = ("duplicate", "split", "remove", "relocate", "sample_add")
 RELOCATED = ("opacities", "scales", "ratios", "binoms")
 SHAPED = ("quats", "scales", "compute_covar", "compute_preci", "triu")
 DEFAULT, MCMC = f"{PACKAGE}.strategy.default", f"{PACKAGE}.strategy.mcmc"
@@ -52,7 +51,6 @@ LPIPS = Seam(
     Role.METRIC, "torchmetrics.image.lpip", "LearnedPerceptualImagePatchSimilarity", external=True
 )
 """With what gsplat's trainer and nerfstudio measure."""
-ROWS = "fragprune_rows"  # key under which row numbers ride along while a strategy changes rows
 DRIFT = 1e-3  # how far the numbers of a pose that learns move from one visit to the next, at most
 KEYS = ("means", "sh0", "shN", "opacities", "scales", "quats")
 NAMES = {key: group.name for key, group in zip(KEYS, GROUPS, strict=True)}
@@ -62,36 +60,6 @@ NAMES = {key: group.name for key, group in zip(KEYS, GROUPS, strict=True)}
 def optimizers(call: SeamCall) -> list[Any]:
     """The optimizers, one for each key."""
     return list(call.arguments["optimizers"].values())
-
-
-@contextmanager
-def tracing(call: SeamCall) -> Iterator[RowTrace]:
-    """Store row numbers under one more key, with an optimizer: 1.4 asks every key for one.
-
-    float64 holds every row number exactly.
-    """
-    import torch
-
-    model, trace, optimizers = call.model, RowTrace(), call.arguments["optimizers"]
-    rows = len(model["means"])
-    numbers = torch.arange(rows, dtype=torch.float64, device=model["means"].device)
-    model[ROWS] = torch.nn.Parameter(numbers, requires_grad=False)
-    optimizers[ROWS] = torch.optim.SGD([model[ROWS]], lr=0.0)
-    try:
-        yield trace
-    finally:
-        del optimizers[ROWS]
-        origins = model.pop(ROWS).detach().long()
-    places = torch.arange(len(origins), device=origins.device)
-    fresh = torch.zeros_like(places, dtype=torch.bool)
-    name = call.seam.attribute
-    if name == "duplicate":
-        fresh = places >= rows
-    elif name == "split":
-        fresh = places >= len(places) - 2 * int(call.arguments["mask"].sum())
-    elif name in ("relocate", "sample_add"):  # parents are made over too
-        fresh = torch.bincount(origins, minlength=rows)[origins] > 1
-    trace.origins, trace.fresh = origins, fresh
 
 
 def answered(module: str, name: str, *needs: str, by: str) -> Seam:
@@ -147,10 +115,6 @@ def read_again(call: SeamCall) -> tuple[Path, Tensor] | None:
     return (Path(file), splats["means"].detach().cpu()) if splats and file else None
 
 
-def _operation(name: str, *needs: str) -> Seam:
-    return Seam(Role.REARRANGE, OPERATIONS, name, ("params", "optimizers", *needs), how=tracing)
-
-
 class Gsplat(HostAdapter):
     """The adapter of gsplat."""
 
@@ -176,11 +140,7 @@ class Gsplat(HostAdapter):
         Seam(Role.VIEW, RENDERING, "rasterization_2dgs", ("viewmats",), how=surfels),
         Seam(Role.LOSS, "torch", "Tensor.backward", external=True),
         Seam(Role.ATTACH, BASE, "Strategy.check_sanity", ("params", "optimizers"), how=optimizers),
-        _operation("duplicate", "mask"),
-        _operation("split", "mask"),
-        _operation("remove", "mask"),
-        _operation("relocate", "mask"),
-        _operation("sample_add", "n"),
+        *(Seam(Role.REARRANGE, OPERATIONS, name, ("params",)) for name in REARRANGING),
         Seam(Role.STILL, OPERATIONS, "reset_opa", ("params",)),
         Seam(Role.STILL, OPERATIONS, "inject_noise_to_position", ("params",)),
         Seam(Role.STILL, DEFAULT, "DefaultStrategy.step_pre_backward", ("params",)),

@@ -10,13 +10,8 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cached_property
 from inspect import Signature, signature
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from weakref import WeakKeyDictionary
-
-from fragprune_plugins.types import one_line
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 class Role(Enum):
@@ -50,9 +45,8 @@ class Role(Enum):
     KEEP = "keep the surviving rows"
     APPEND = "append rows, with the thresholds of those whose copies they are"
     REARRANGE = (
-        "keep, copy and append rows in one call; does nothing in stage 2",
-        "around: a context manager that makes the host's own code carry row numbers; it "
-        "yields a ``RowTrace``, which is complete at exit",
+        "follow rows that one call keeps, overwrites, copies and appends; nothing in stage 2",
+        "before and after: by name the tensors (N, ...) that tell rows apart (the param groups)",
     )
     STILL = (
         "do nothing in stage 2: for functions that would change frozen parameters or rows",
@@ -79,7 +73,7 @@ class Role(Enum):
         self.does, self.how = does, how
 
 
-NEEDS_HOW = frozenset({Role.ATTACH, Role.REARRANGE, Role.PACK, Role.UNPACK, Role.ANSWER})
+NEEDS_HOW = frozenset({Role.ATTACH, Role.PACK, Role.UNPACK, Role.ANSWER})
 """Roles whose seams need a ``how`` from the adapter."""
 
 
@@ -171,22 +165,6 @@ class SeamCall:
     def how(self, otherwise: Any = None) -> Any:
         """The result of the seam's ``how`` for this call; ``otherwise`` if it has none."""
         return otherwise if self.seam.how is None else self.seam.how(self)
-
-
-@dataclass
-class RowTrace:
-    """Where rows came from, once a host has rearranged them.
-
-    Attributes:
-        origins: (M,) int64, for each row of the model as it is now, the row it was or was copied
-            from; None where nothing happened.
-        fresh: (M,) bool, True for rows that are new or overwritten Gaussians.
-    """
-
-    origins: Tensor | None = None
-    fresh: Tensor | None = None
-
-    __repr__ = one_line
 
 
 def revised(

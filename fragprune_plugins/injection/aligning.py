@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
+
+import torch
+from torch import Tensor
 
 from fragprune_plugins.hosts.seams import SeamCall
 from fragprune_plugins.injection.state import SessionState
@@ -14,16 +18,18 @@ def on_append(session: SessionState, call: SeamCall) -> Any:
     state = session.models.get(call.model)
     if state is None:
         return call.run()
-    new = call.first
-    copied = [group.name for group in session.adapter.groups if group.copied and group.name in new]
-    parents = None
-    if copied and not state.store.neutral:
-        own = {name: group["params"][0] for name, group in session.groups(call.model)}
-        parents = copies(*([rows[name] for name in copied] for rows in (own, new)))
+    new, parents = call.first, None
+    if copied := _copied(session, new) if not state.store.neutral else []:
+        parents = copies(_copied(session, _rows(session, call)), copied)
     result = call.run()
     with session.changing(state.store, "append"):
         state.store.append(len(next(iter(new.values()))), parents)
     return result
+
+
+def _copied(session: SessionState, rows: Mapping[str | None, Tensor]) -> list[Tensor]:
+    """Of the values of rows, by group, those that children copy."""
+    return [rows[each.name] for each in session.adapter.groups if each.copied and each.name in rows]
 
 
 def on_keep(session: SessionState, call: SeamCall) -> Any:
@@ -37,20 +43,33 @@ def on_keep(session: SessionState, call: SeamCall) -> Any:
 
 
 def on_rearrange(session: SessionState, call: SeamCall) -> Any:
-    """Follow rows through one operation that keeps, copies and appends. In stage 2 nothing runs."""
+    """Follow rows through one call that keeps, overwrites, copies, adds; none runs in stage 2."""
     if session.standing_still(call.model):
         return None
     state = session.models.get(call.model)
     if state is None:
         return call.run()
-    with call.how() as trace:
-        result = call.run()
-    if trace.origins is not None and trace.fresh is not None:
+    before, result, after = _rows(session, call), call.run(), _rows(session, call)
+    if not all(map(torch.equal, before.values(), after.values())):  # else gradients stay to be used
         with session.changing(state.store, "rearrange"):
-            state.store.rearrange(trace.origins, trace.fresh)
-            state.views.clear()  # their calls may hold tensors of the old rows
+            if state.store.neutral:
+                state.store.replace(len(session.adapter.means(call.model)))
+            else:
+                parents = copies(_copied(session, before), _copied(session, after))
+                same, now = (copies([*e.values()], [*after.values()]) for e in (before, after))
+                fresh = (same < 0) | (now < torch.arange(len(now), device=now.device))
+                state.store.rearrange(torch.where(same < 0, parents, same), fresh)
+        state.views.clear()  # their calls may hold tensors of the old rows
     session.expect_rows(call.model, state, str(call.seam))
     return result
+
+
+def _rows(session: SessionState, call: SeamCall) -> dict[str | None, Tensor]:
+    """What tells a model's rows apart, by group: all values but colours that are not copied."""
+    told = {each.name for each in session.adapter.groups if each.copied or not each.colour}
+    groups = ((name, group["params"][0]) for name, group in session.groups(call.model))
+    rows = call.how() or {name: each for name, each in groups if name in told}
+    return {name: each.detach().clone() for name, each in rows.items()}
 
 
 def on_still(session: SessionState, call: SeamCall) -> Any:

@@ -20,6 +20,7 @@ from fragprune_plugins.types import Rim, is_rim, is_stop, short
 _START_MARGIN = 1e-4  # thresholds start this far (relative) below the 1/255 skip: nothing changes
 _START_MAX = 0.99
 MOMENTS = {"exp_avg": "their moments", "exp_avg_sq": "their second moments"}  # Adam's
+_MIXING = 0x9E3779B97F4A7C15  # odd, with bits in no order
 _ROUNDING = 1e-4  # relative: sigmoid of logit loses less, unless the logit had to be clamped
 
 Known = TypeVar("Known")
@@ -261,11 +262,12 @@ class ThresholdStore:
         """Keep, copy and append rows at once: row i takes the values of row ``origins[i]``.
 
         Args:
-            origins: (M,) int64, for each of the M new rows the old row it descends from.
+            origins: (M,) int64, for each of the M new rows the old one it descends from, or -1.
             fresh: (M,) bool, True where the row is a new Gaussian: its moments are zero.
         """
-        origins = self._rows(origins, len(fresh), "rearrange")
+        origins = self._rows(origins, len(fresh), "rearrange", least=-1)
         self._resize(lambda rows: rows[origins])
+        self.logits.detach()[origins < 0] = NEUTRAL_LOGIT
         for name in MOMENTS.keys() & self.adam:
             self.adam[name][fresh] = 0
 
@@ -355,13 +357,14 @@ def _misfit(found: str, expected: str) -> SidecarError:
 def copies(known: Sequence[Tensor], new: Sequence[Tensor]) -> Tensor:
     """(M,) int64 for each new row the first that has its values bit for bit, -1 for none.
 
-    A row is the values at its place in all tensors, (N, ...) of those that are known, (M, ...) of
-    the new ones.
+    A row is the values at its place in all tensors: (N, ...) the known ones, (M, ...) the new ones.
     """
-    tables = [torch.cat([each.detach().flatten(1) for each in rows], 1) for rows in (known, new)]
-    bits = torch.cat(tables).float().view(torch.int32)
-    kinds: Tensor = torch.unique(bits, dim=0, return_inverse=True)[1]
-    first = kinds.new_full((len(bits),), -1)
-    numbers = torch.arange(len(known[0]), device=first.device)
+    tables = ([each.detach()[..., None].flatten(1) for each in rows] for rows in (known, new))
+    bits = torch.cat([torch.cat(each, 1) for each in tables]).float().view(torch.int32)
+    weights = [pow(_MIXING, 1 + column, 1 << 63) for column in range(bits.shape[1])]
+    sums = (bits * torch.tensor(weights, device=bits.device)).sum(1)  # sorted faster than rows
+    kinds: Tensor = torch.unique(sums, return_inverse=True)[1]
+    first, numbers = torch.full_like(kinds, -1), torch.arange(len(known[0]), device=bits.device)
     first.scatter_reduce_(0, kinds[: len(numbers)], numbers, "amin", include_self=False)
-    return first[kinds[len(numbers) :]]
+    found = first[kinds[len(numbers) :]]
+    return found.where((bits[found] == bits[len(numbers) :]).all(1), -1)

@@ -2,33 +2,22 @@
 
 import json
 
-import torch
 from miniatures import runs
 from miniatures.mcmc import MCMCHost
 from miniatures.runs import OPTIONS, miniature
-from miniatures.vanilla_3dgs import joint
 
+from fragprune_3dgs_fork import ForkAdapter
 from fragprune_mcmc import MCMC
 from fragprune_plugins.injection.launch import run
-
-COUNT = 24
-
+from fragprune_plugins.testing import invariants
+from fragprune_plugins.testing.fresh import fresh
 
 mini, of = miniature(MCMCHost, MCMC)
 
 
-def test_parents_of_a_relocation_are_not_taken_for_those_of_a_later_append(mini):
-    with joint(**of(mini)) as host:
-        model = host.model(COUNT)
-        host.step(model, host.camera(), 1)
-        with torch.no_grad():
-            model.relocate_gs(dead_mask=torch.arange(COUNT) < 2)
-            groups = model.optimizer.param_groups
-            strangers = [torch.rand_like(group["params"][0][:2]) for group in groups]
-            model.densification_postfix(*strangers)  # the groups' order is its parameters'
-        values = host.store(model).values.detach()
-        assert len(values) == COUNT + 2
-        assert (values[-2:] < 1e-12).all()  # neutral: nobody's children
+def test_a_fork_that_relocates_is_followed(tmp_path):
+    MCMCHost().write(tmp_path)
+    fresh(invariants.alignment, invariants.Case(ForkAdapter(), MCMCHost(), tmp_path, examples=4))
 
 
 def command(mini, scene, out, iterations, *more):

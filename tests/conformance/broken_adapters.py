@@ -1,19 +1,14 @@
 """Adapters with one fault each, which the conformance kit must find."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
 import torch
 
-import fragprune_gsplat
 from fragprune_gaussian_splatting import GaussianSplatting
 from fragprune_graphdeco import GraphdecoDialect
 from fragprune_graphdeco.adapter import completed
-from fragprune_gsplat import Gsplat
-from fragprune_mcmc import MCMC, following_copies
-from fragprune_plugins.adapting import CHECKPOINT_KEY, Role, RowTrace, revised
+from fragprune_plugins.adapting import CHECKPOINT_KEY, revised
 from fragprune_plugins.hosts.findings import Match
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
@@ -90,20 +85,6 @@ class LetsItReset(Vanilla3DGS):
     seams = revised(Vanilla3DGS.seams, {"GaussianModel.reset_opacity": None})
 
 
-@contextmanager
-def inherited(call: Any) -> Iterator[RowTrace]:
-    with following_copies(call) as trace:
-        yield trace
-    if trace.fresh is not None:  # some rows were copied
-        trace.fresh = torch.zeros_like(trace.fresh)
-
-
-class LetsMomentsBeInherited(MCMC):
-    """Gives copies their parents' moments."""
-
-    seams = tuple(replace(s, how=inherited) if s.role is Role.REARRANGE else s for s in MCMC.seams)
-
-
 class SavesNothing(Vanilla3DGS):
     """Does not know where the host saves."""
 
@@ -171,17 +152,3 @@ class HoldsStepsBack(GaussianSplatting):
     """Holds back the step in which opacities would be reset, and the thresholds' with it."""
 
     seams = revised(GaussianSplatting.seams, {"OpacityResetter.optim_step": {"how": None}})
-
-
-@contextmanager
-def littered(call: Any) -> Iterator[RowTrace]:
-    with fragprune_gsplat.tracing(call) as trace:
-        yield trace
-    rows = torch.zeros(len(call.model["means"]))
-    call.model[fragprune_gsplat.ROWS] = torch.nn.Parameter(rows, requires_grad=False)
-
-
-class LeavesItsRowNumbers(Gsplat):
-    """Leaves its row numbers in the user's model."""
-
-    seams = tuple(replace(s, how=littered) if s.role is Role.REARRANGE else s for s in Gsplat.seams)

@@ -1,12 +1,10 @@
 """What a session does with a host's rows, handler by handler. Whole hosts: tests/conformance."""
 
-import contextlib
-
 import pytest
 import torch
 from core.sessions import Model, Role, call, follow, state
 
-from fragprune_plugins.adapting import AlignmentError, RowTrace
+from fragprune_plugins.adapting import AlignmentError, ParamGroup
 from fragprune_plugins.injection.session import OF_MODELS
 from fragprune_plugins.learning.thresholds import NEUTRAL_LOGIT
 
@@ -64,46 +62,68 @@ def test_a_model_that_is_not_followed_is_the_hosts_own_business(session, role):
     assert session.plugins.told == []
 
 
-def rearrange(session, model, trace, rows=None):
-    events = []
-
-    @contextlib.contextmanager
-    def tracing(_):
-        events.append("begun")
-        yield trace
-        events.append("over")
+def rearranged(session, model, rows, moved=()):
+    """The model's rows as they are in an operation that takes these, and moves those at places."""
 
     def host():
-        events.append("host")
-        if rows is not None:
-            model.xyz = torch.nn.Parameter(model.xyz.detach()[rows])
+        (group, other) = model.optimizer.param_groups
+        with torch.no_grad():
+            model.xyz = torch.nn.Parameter(model.xyz[rows])
+            model.opacity = torch.nn.Parameter(model.opacity[rows])
+            model.opacity[list(moved)] += 0.25
+        group["params"], other["params"] = [model.xyz], [model.opacity]
         return "rearranged"
 
-    result = OF_MODELS[Role.REARRANGE](session, call(model, Role.REARRANGE, host, how=tracing))
-    return result, events
+    return OF_MODELS[Role.REARRANGE](session, call(model, Role.REARRANGE, host))
 
 
-@pytest.mark.parametrize("trace", [RowTrace(), RowTrace(torch.tensor([0])), RowTrace(None, None)])
-def test_an_operation_that_did_nothing_changes_nothing(session, trace):
+ARRANGED = {
+    "kept elsewhere": ((4, 0, 2), (), "..."),
+    "cloned": ((0, 1, 2, 3, 4, 5, 4), (), "......n"),
+    "split: both children are moved": ((0, 1, 2, 3, 5, 4, 4), (5, 6), ".....nn"),
+    "overwritten by a copy, its parent changed, too": ((0, 1, 5, 3, 4, 5), (2, 5), "..n..n"),
+}
+
+
+@pytest.mark.parametrize("what", ARRANGED)
+def test_thresholds_follow_their_rows_to_new_places_and_observers_are_told(session, what):
     model, known = follow(session)
-    known.views[3] = print
-    assert rearrange(session, model, trace)[0] == "rearranged"
-    assert torch.equal(known.store.logits, LOGITS)
+    session.adapter.groups = (ParamGroup("xyz", copied=True), ParamGroup("o"))
+    rows, moved, fresh = ARRANGED[what]
+    origins, new = torch.tensor(rows), torch.tensor([each == "n" for each in fresh])
+    assert rearranged(session, model, origins, moved) == "rearranged"
+    assert torch.equal(known.store.logits, LOGITS[origins])
+    assert torch.equal(known.store.adam["exp_avg"], torch.where(new, 0.0, 1.0 + origins))
+    assert told(session) == [("rearrange", 6, len(rows))]
+
+
+def test_an_operation_that_did_nothing_changes_nothing(session):
+    model, known = follow(session)
+    known.views[3], before = print, known.store.logits
+    assert rearranged(session, model, torch.arange(6)) == "rearranged"
+    assert known.store.logits is before  # with its gradient
     assert (list(known.views), told(session)) == ([3], [])
 
 
-def test_thresholds_follow_their_rows_to_new_places_and_observers_are_told(session):
-    model, known = follow(session)
-    rows = torch.tensor([4, 0, 2])
-    rearrange(session, model, RowTrace(rows, torch.zeros(3, dtype=torch.bool)), rows)
-    assert torch.equal(known.store.logits, LOGITS[rows])
-    assert told(session) == [("rearrange", 6, 3)]
-
-
-def test_an_operation_whose_rows_nobody_traced_is_refused(session):
+def test_rows_that_no_known_optimizer_has_are_not_lost_silently(session):
     model, _ = follow(session)
-    with pytest.raises(AlignmentError, match="host:f: 4 Gaussians"):
-        rearrange(session, model, RowTrace(), torch.arange(4))
+    session.optimizers[model] = []
+    with pytest.raises(AlignmentError, match="host:f: 3 Gaussians"):
+        rearranged(session, model, torch.arange(3))
+
+
+def test_of_neutral_thresholds_only_the_number_is_followed(session):
+    model, known = follow(session)
+    known.store.replace(6)
+    rearranged(session, model, torch.tensor([1, 1, 3]), (0, 1))
+    assert (len(known.store), known.store.neutral) == (3, True)
+
+
+def test_a_row_that_is_no_copy_is_neutral(session):
+    model, known = follow(session)
+    session.adapter.groups = (ParamGroup("xyz"), ParamGroup("o", copied=True))
+    rearranged(session, model, torch.tensor([0, 1]), (1,))
+    assert known.store.logits.tolist() == [LOGITS[0], pytest.approx(NEUTRAL_LOGIT)]
 
 
 @pytest.mark.parametrize("role", [Role.REARRANGE, Role.STILL])
