@@ -3,10 +3,8 @@
 import pytest
 from miniatures.hosts import HOSTS
 from miniatures.runs import command, written
-from miniatures.vanilla_3dgs import HOST
 
 from fragprune_plugins.adapting import HostRepo, UsageError
-from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.testing.conformance import found_adapter
 
@@ -50,13 +48,6 @@ def test_a_configuration_file_overrides_the_flag_as_it_does_in_the_host(tmp_path
     file.write_text('{"densify_until_iter": 400}')
     words = [*UNTIL, "--config", str(file)]
     assert found_adapter("mcmc").densified(HostRepo(root), root / "train.py", words) == 400
-
-
-def test_joint_learning_begins_when_densification_is_over(photographs, tmp_path):
-    words = command(HOST / "train.py", photographs, tmp_path / "out", 24)
-    summary = run(words, RunOptions(stage="joint", device="cpu"))
-    assert [row["step"] for row in summary.curves] == [19, 20, 21, 22, 23]  # flags say 18
-    assert sidecar.load(summary.model_after)[0].steps == 5
 
 
 @pytest.mark.parametrize(

@@ -16,33 +16,17 @@ from cli.commands import run as command_line
 from finetune.several import ended
 from miniatures import runs
 from miniatures.hosts import HOSTS
-from miniatures.runs import FINETUNE, OFF, OPTIONS, check_stage_two
+from miniatures.runs import FINETUNE, OFF, OPTIONS
 from miniatures.vanilla_3dgs import HOST, InterruptAt, running
 
 from fragprune_plugins import Control, Fewer, Portable, Pressure, Settings
 from fragprune_plugins.adapting import Interrupted, SessionError, UsageError, read_ply
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection.launch import RunOptions, run
-from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins.loading import installed
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
 command = partial(runs.command, HOST / "train.py")
-
-
-def test_learning_from_an_iteration_on_freezes_from_there(photographs, tmp_path):
-    """One run, its first ten iterations the host's own, densification included."""
-    settings = Settings(train="opacity")
-    options = RunOptions(stage="finetune", from_iter=12, device="cpu", settings=settings)
-    flags = ("--save_iterations", 14, "--checkpoint_iterations", 12)
-    out = tmp_path / "out"
-    summary = run(command(photographs, out, 20, *flags), options)
-    capture, _ = torch.load(out / "chkpnt12.pth", weights_only=False)
-    final = read_ply(summary.model_after)
-    assert torch.equal(capture[1].detach(), final.xyz)
-    assert torch.equal(capture[4].detach(), final.scaling)
-    assert len(final.xyz) != 150
-    assert summary.steps == 7  # of 13 to 20: hosts take no step in the last
 
 
 @pytest.fixture(scope="module")
@@ -126,31 +110,6 @@ def test_sigterm_in_stage_one_ends_the_process_as_the_host_alone(photographs, tm
     words = ["run", "--device", "cpu", "--", str(script)]
     words += command(photographs, tmp_path / "out", 10)[1:]
     assert ended(lambda: command_line(*words)) == -signal.SIGTERM
-
-
-def test_train_then_finetune_then_render(photographs, tmp_path):
-    out = tmp_path / "out"
-    summary = run(command(photographs, out, 12), OPTIONS)
-    check_stage_two(summary, "vanilla-3dgs")  # eight steps, though hosts take none in their last
-    assert summary.stage == "auto"
-    assert [c["step"] for c in summary.curves] == list(range(1, 9))
-    # the host's own render script, with and without what lies beside its model
-    renders = out / "test" / "ours_21" / "renders"
-    script = str(HOST / "render.py")
-    run(["python", script, "-m", str(out), "--skip_train"], OPTIONS)
-    truncated = [p.read_bytes() for p in sorted(renders.iterdir())]
-    sidecar.path_beside(summary.model_after).unlink()
-    run(["python", script, "-m", str(out), "--skip_train"], OPTIONS)
-    assert truncated != [p.read_bytes() for p in sorted(renders.iterdir())]
-
-
-def test_a_model_written_over_a_pruned_one_does_not_keep_its_cutoffs(photographs, trained):
-    """Stage 1 writes where joint learning wrote: whoever read that pair refused it."""
-    (model,) = trained.glob("point_cloud/*/*.ply")
-    model.write_bytes(b"of joint learning")
-    sidecar.save(model, ThresholdStore(0))
-    run(command(photographs, trained, 10), OFF)
-    assert sidecar.find(model) is None
 
 
 PORTABLE = replace(FINETUNE, settings=Settings(iterations=8, goal=Portable()))

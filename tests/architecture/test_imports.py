@@ -94,25 +94,33 @@ print(json.dumps(heavy))
     assert loaded == []
 
 
-def test_loading_every_plugin_imports_no_torch(python):
-    assert python(
-        "import json, sys\n"
-        "from fragprune_plugins.plugins.loading import load_plugins\n"
-        "plugins = load_plugins()\n"
-        "names = [(a.name, a.info.title, [str(s) for s in a.seams]) for a in plugins.adapters]\n"
-        "print(json.dumps([bool(names), 'torch' in sys.modules]))"
-    ) == [True, False]
-
-
-def test_to_draw_with_cutoffs_imports_no_compiler(python):
-    """torch takes a second for it, and asks for it where an optimizer is made."""
-    assert python(
-        "import json, sys, torch\n"
-        "import fragprune_plugins as fp\n"
-        "store = fp.ThresholdStore.from_falloff(torch.tensor([0.1, 0.2])).clone()\n"
-        "store.keep(torch.tensor([True, False]))\n"
-        "print(json.dumps([len(store), 'torch._dynamo' in sys.modules]))"
-    ) == [1, False]
+@pytest.mark.parametrize(
+    ("code", "absent"),
+    [
+        (
+            "from fragprune_plugins.plugins.loading import load_plugins as load\n"
+            "assert [(a.name, a.info.title, [str(s) for s in a.seams]) for a in load().adapters]",
+            "torch",
+        ),
+        (
+            "from fragprune_plugins.engines.cpu import binding; "
+            "assert binding.available() or not binding.usable_builds()",
+            "torch",
+        ),
+        ("import fragprune_plugins.workbench.run.started", "torch"),  # by many scripts of a sweep
+        (
+            "import torch, fragprune_plugins as fp\n"
+            "store = fp.ThresholdStore.from_falloff(torch.tensor([0.1, 0.2])).clone()\n"
+            "store.keep(torch.tensor([True, False]))\n"
+            "assert len(store) == 1",
+            "torch._dynamo",  # which an optimizer asks for, and torch takes a second for it
+        ),
+    ],
+    ids=["every plugin", "compiled code", "a script of no host", "drawing with cutoffs"],
+)
+def test_what_takes_long_to_import_is_left_out(python, code, absent):
+    said = f"{code}\nimport json, sys\nprint(json.dumps('{absent}' in sys.modules))"
+    assert python(said) is False
 
 
 def test_import_rules_hold():

@@ -10,9 +10,8 @@ import torch
 from cli.commands import run, run_json, succeeds
 from finetune import tiny
 
-from fragprune_plugins import Model
+from fragprune_plugins import Model, RasterInputs, RasterOutputs
 from fragprune_plugins.engines import create_engine
-from fragprune_plugins.types import RasterInputs, RasterOutputs
 from fragprune_plugins.workbench.bench import timing, work
 from fragprune_plugins.workbench.bench.scene import make_scene, make_view
 from fragprune_plugins.workbench.bench.timing import Case, measure

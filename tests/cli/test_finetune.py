@@ -11,9 +11,8 @@ from cli.commands import run, run_error, run_json, succeeds
 from finetune import tiny
 
 import fragprune_plugins as fp
-from fragprune_plugins.errors import InputError
+from fragprune_plugins.adapting import InputError, read_ply
 from fragprune_plugins.files import sidecar
-from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.learning.pressure import LEAST_PRESSURE
 from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.finetune import loop

@@ -13,7 +13,7 @@ from finetune import tiny
 from PIL import Image
 
 import fragprune_plugins as fp
-from fragprune_plugins import RasterInputs
+from fragprune_plugins import RasterInputs, load_dataset
 from fragprune_plugins.errors import DatasetError, ModelFileError
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.workbench.commands.opening import as_trained
@@ -21,7 +21,6 @@ from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.finetune import work
 from fragprune_plugins.workbench.models.formats.ply import write_ply
 from fragprune_plugins.workbench.scenes import generated
-from fragprune_plugins.workbench.scenes.dataset import load_dataset
 from fragprune_plugins.workbench.scenes.output import newest_model, trained_on
 
 

@@ -13,9 +13,8 @@ from cli.commands import run, run_error, run_json, succeeds
 from finetune import tiny
 
 import fragprune_plugins as fp
-from fragprune_plugins import Model
+from fragprune_plugins import Model, load
 from fragprune_plugins.workbench.figures import records
-from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.report import page as report_page
 from fragprune_plugins.workbench.scenes.generated import around, bounds
 

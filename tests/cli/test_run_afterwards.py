@@ -12,9 +12,8 @@ from finetune import tiny
 from miniatures.runs import TINY, edit
 from miniatures.vanilla_3dgs import HOST
 
+from fragprune_plugins.adapting import Photographs, Resolution, read_ply
 from fragprune_plugins.files.atomic import locked
-from fragprune_plugins.files.ply import read_ply
-from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.workbench.commands import cli
 from fragprune_plugins.workbench.figures.records import beside, recorded
 

@@ -12,8 +12,7 @@ from installed.gaussian_splatting_host import GaussianSplattingHost
 from miniatures.vanilla_3dgs import HOST
 
 from fragprune_plugins import testing
-from fragprune_plugins.adapting import HostRepo
-from fragprune_plugins.hosts.seams import Role
+from fragprune_plugins.adapting import HostRepo, Role
 from fragprune_plugins.plugins.loading import load_plugins
 from fragprune_plugins.testing import Host, conformance, invariants
 from fragprune_plugins.testing.fresh import FreshProcessError, NotApplicable, fresh

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from fragprune_plugins import Control, Fewer, Portable, Pressure, ThresholdStore
-from fragprune_plugins.errors import ResetError, UsageError
+from fragprune_plugins.errors import ResetError
 from fragprune_plugins.learning.schedule import JointSchedule, Schedule, Settings, StepPlan
 from fragprune_plugins.learning.stage2 import Stage2, evenly_spaced, stored_thresholds
 from fragprune_plugins.workbench.finetune.faster import FrameTarget
@@ -289,11 +289,6 @@ def test_no_target_makes_fragments_fewer_than_twentyfold():
         it.end()
     assert it.progress().target_reached is False
     assert float(1 - it.store.values.detach().mean()) >= 1 / 20 - 1e-3
-
-
-def test_a_driver_without_a_clock_refuses_a_target_time():
-    with pytest.raises(UsageError, match="fewer fragments"):
-        stage(settings=Settings(iterations=10, goal=Faster(1.5)))
 
 
 def test_opacities_are_worked_out_only_while_there_are_rows_to_open():

@@ -1,12 +1,10 @@
 """Readers of photographs and cameras: COLMAP text and binary, Blender, cameras.json."""
 
-import os
 from pathlib import Path
 
 import pytest
 import torch
 from finetune import tiny
-from finetune.tiny import NAMES, stems
 from PIL import Image
 
 from fragprune_plugins.errors import DatasetError
@@ -15,30 +13,6 @@ from fragprune_plugins.workbench.scenes.dataset import load_dataset
 VIEW, TEST = Path("images/view03.png"), Path("transforms_test.json")
 CAMERAS, IMAGES = Path("sparse/0/cameras.txt"), Path("sparse/0/images.txt")
 COLMAP, BLENDER = tiny.write_colmap, tiny.write_blender
-
-
-def check(dataset, images):
-    """Names, poses and pixels are those of the scene."""
-    assert stems(dataset.test) == ["view00", "view08"]
-    assert stems(dataset.train) == NAMES[1:8]
-    for shot in [*dataset.train, *dataset.test]:
-        index = NAMES.index(Path(shot.name).stem)
-        want = tiny.cameras()[index].view()
-        torch.testing.assert_close(shot.view.viewmatrix, want.viewmatrix)
-        torch.testing.assert_close(shot.view.projmatrix, want.projmatrix)
-        torch.testing.assert_close(shot.view.campos, want.campos)
-        assert shot.view.tan_fov_x == pytest.approx(want.tan_fov_x)
-        assert shot.image.shape == (3, tiny.SIDE, tiny.SIDE)
-        torch.testing.assert_close(shot.image, images[index], atol=0.5 / 255 + 1e-6, rtol=0)
-
-
-@pytest.mark.parametrize("binary", [False, True])
-def test_colmap(tmp_path, images, binary):
-    check(load_dataset(tiny.write_colmap(tmp_path, images, binary=binary)), images)
-
-
-def test_blender(tmp_path, images):
-    check(load_dataset(tiny.write_blender(tmp_path, images)), images)
 
 
 def test_alpha_is_composited_over_the_background(tmp_path, images):
@@ -141,25 +115,3 @@ def test_what_is_no_scene_or_two_is_refused_by_name(tmp_path, images):
     tiny.write_blender(tmp_path, images)
     with pytest.raises(DatasetError, match="both COLMAP's and a transforms layout"):
         load_dataset(tmp_path)
-
-
-def shared_data() -> Path | None:
-    named = os.environ.get("FRAGPRUNE_TEST_DATA")
-    beside = Path(__file__).parents[3] / "shared" / "data"
-    found = Path(named) if named else beside
-    return found if found.is_dir() else None
-
-
-@pytest.mark.skipif(
-    shared_data() is None, reason="real scenes absent: set FRAGPRUNE_TEST_DATA to their folder"
-)
-@pytest.mark.parametrize("scene", ["fox/{}160", "textured_room/{}"])
-def test_both_layouts_of_a_real_scene_agree(scene):
-    folder = shared_data()
-    colmap, blender = (load_dataset(folder / scene.format(k)) for k in ("colmap", "blender"))
-    for first, second in ((colmap.train, blender.train), (colmap.test, blender.test)):
-        second = sorted(second, key=lambda shot: shot.name)
-        assert stems(first) == [shot.name for shot in second]
-        for a, b in zip(first, second, strict=True):
-            torch.testing.assert_close(a.view.projmatrix, b.view.projmatrix, atol=1e-4, rtol=0)
-        assert torch.equal(first[0].image, second[0].image)

@@ -10,9 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from fragprune_plugins import rasterize
+from fragprune_plugins import View, rasterize
 from fragprune_plugins.errors import DatasetError
-from fragprune_plugins.types import View
 from fragprune_plugins.workbench.render.filming import orbit
 from fragprune_plugins.workbench.scenes.generated import (
     around,

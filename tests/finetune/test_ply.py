@@ -11,9 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 
-from fragprune_plugins.adapting import InputError, Model, ModelFileError
+from fragprune_plugins.adapting import InputError, Model, ModelFileError, read_ply
 from fragprune_plugins.constants import NEUTRAL_LOGIT
-from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.workbench.models.formats.ply import write_ply
 
 

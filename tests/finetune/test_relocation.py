@@ -8,14 +8,12 @@ from finetune import tiny
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fragprune_plugins import Control, Portable, Pressure, Settings, finetune
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import InputError, UsageError
-from fragprune_plugins.learning.goals import Control, Portable, Pressure
-from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import MOMENTS, ThresholdStore
 from fragprune_plugins.workbench.figures.evaluate import Candidate, psnrs
 from fragprune_plugins.workbench.finetune import loop
-from fragprune_plugins.workbench.finetune.api import finetune
 from fragprune_plugins.workbench.finetune.relocation import (
     DEEPER,
     PACE,

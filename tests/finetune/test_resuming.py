@@ -9,15 +9,12 @@ from finetune import tiny
 from PIL import Image
 from safetensors.torch import save_file
 
+from fragprune_plugins import Control, Faster, Fewer, Portable, Pressure, finetune, load_dataset
 from fragprune_plugins.errors import CheckpointError, DivergedError, OutputError
 from fragprune_plugins.learning import schedule
-from fragprune_plugins.learning.goals import Control, Fewer, Portable, Pressure
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.workbench.finetune import loop, resuming
-from fragprune_plugins.workbench.finetune.api import finetune
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
-from fragprune_plugins.workbench.goals import Faster
-from fragprune_plugins.workbench.scenes.dataset import load_dataset
 
 ALL = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
 STEPS = 12

@@ -244,18 +244,6 @@ def test_spz_of_a_scene_wider_than_its_usual_bits(tmp_path):
     assert not (tmp_path / "b.spz").exists()
 
 
-@pytest.mark.parametrize("suffix", [".spz", ".sog", ".glb", ".splat"])
-@pytest.mark.parametrize(
-    "content", [b"", bytes(7), bytes(40), b"NGSP", b"PK\x03\x04", b"glTF\x02", b"ply\n"]
-)
-def test_what_is_no_such_file_is_one_error(suffix, content, tmp_path):
-    path = tmp_path / f"a{suffix}"
-    path.write_bytes(content)
-    with pytest.raises(ModelFileError) as caught:
-        load(path)
-    assert caught.value.where == str(path)
-
-
 def test_a_missing_file_names_what_is_read(tmp_path):
     with pytest.raises(ModelFileError, match=r"\.sog"):
         load(tmp_path / "a.spz")

@@ -142,16 +142,6 @@ def test_larger_scenes_equal_the_cpu_engine(engine, n, width, height, size):
     assert (expected.image - found.image)[:, same].abs().max() < 4e-5
 
 
-def test_lists_that_do_not_fit_are_drawn_again_with_more_room(device):
-    inputs, thresholds = scenes.random_scene(0), scenes.random_thresholds(0, 60)
-    whole, small = CudaEngine(device), CudaEngine(device)
-    small.capacity = 7
-    expected, found = (everything(e, inputs, thresholds) for e in (whole, small))
-    assert small.capacity > 60
-    for name in ("image", "alpha", "radii"):
-        assert torch.equal(expected[name], found[name]), name
-
-
 def test_room_that_another_thread_makes_meanwhile_is_not_this_frames(device, monkeypatch):
     inputs, small, read = scenes.random_scene(0), CudaEngine(device), frame.Drawing.read
     expected = small.rasterize(inputs, None).image

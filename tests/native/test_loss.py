@@ -1,4 +1,4 @@
-"""The compiled photometric loss against 121 taps written out in double precision."""
+"""The photometric loss, compiled and in torch, against 121 taps written out in double precision."""
 
 import math
 import sys
@@ -8,7 +8,8 @@ from types import ModuleType
 
 import pytest
 import torch
-from finetune.test_losses import plain_ssim
+from skimage.metrics import structural_similarity
+from torch.nn.functional import conv2d
 
 from fragprune_plugins.engines import losses
 from fragprune_plugins.engines.cpu import binding
@@ -22,6 +23,22 @@ SIZES = [(1, 1), (1, 7), (5, 3), (11, 11), (26, 246), (9, 600), (129, 257)]
 
 
 compiled_loss = partial(losses.compiled_loss, ssim_weight=SSIM_WEIGHT)
+
+
+def plain_ssim(x, y):
+    """The 121 taps written out."""
+    offsets = torch.arange(11).double() - 5
+    line = torch.exp(-(offsets**2) / 4.5)
+    window = torch.outer(line, line)
+    window = (window / window.sum())[None, None]
+
+    def blur(z):
+        return conv2d(z[:, None], window, padding=5)[:, 0]
+
+    mx, my = blur(x), blur(y)
+    vx, vy, c = blur(x * x) - mx**2, blur(y * y) - my**2, blur(x * y) - mx * my
+    below = (mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4)
+    return ((2 * mx * my + 1e-4) * (2 * c + 9e-4) / below).mean()
 
 
 def oracle(image, target, ssim_weight=0.2):
@@ -162,6 +179,16 @@ def test_what_the_compiled_code_does_not_take_is_for_torch():
     for x, y in ((image.double(), target.double()), (image, target.clone().requires_grad_())):
         value, _ = oracle(x, y)
         assert float(photometric_loss(x, y).detach()) == pytest.approx(float(value), abs=1e-6)
+
+
+def test_ssim_agrees_with_scikit_image_inside():
+    """Far from the border the paddings do not differ: a border of equal pixels adds none."""
+    x, y = (z.double() for z in pair("smooth"))
+    how = {"channel_axis": -1, "data_range": 1.0, "gaussian_weights": True, "sigma": 1.5}
+    given = (z.permute(1, 2, 0).numpy() for z in (x, y))
+    _, theirs = structural_similarity(*given, **how, use_sample_covariance=False, full=True)
+    ours, inside = ssim_map(x, y).permute(1, 2, 0).numpy(), slice(10, -10)
+    assert ours[inside, inside] == pytest.approx(theirs[inside, inside], abs=1e-9)
 
 
 def test_without_compiled_code_torch_does_it(monkeypatch):

@@ -55,13 +55,6 @@ def test_a_fragment_is_drawn_where_any_of_its_pixel_is_covered():
     assert torch.equal(soft.alpha[0][within], hard.alpha[0][within])
 
 
-def test_no_fragment_is_fainter_than_the_hosts_skip():
-    inputs = replace(ellipse((5.0, 5.0)), rim="soft")
-    with_all = rasterize(replace(inputs, counts=True), None, engine="reference")
-    assert torch.equal(draw(inputs, 1e-9).fragments, with_all.fragments)
-    assert torch.equal(draw(inputs, 1e-9).image, with_all.image)
-
-
 def test_the_counts_gradient_is_that_of_the_covered_area():
     inputs, spread, tau = replace(ellipse((9.0, 9.0)), rim="soft"), 81.3, 0.8
     given = torch.tensor([tau], dtype=F64, requires_grad=True)

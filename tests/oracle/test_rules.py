@@ -119,24 +119,21 @@ def test_a_splat_is_drawn_beyond_three_sigma_inside_its_tiles_and_nowhere_outsid
 
 
 @pytest.mark.parametrize(
-    ("fourth", "drawn", "left"), [(0.95, 3, 1e-3), (0.89, 4, 1.1e-4)], ids=["stops", "goes on"]
+    ("opacities", "stop", "drawn", "left"),
+    [
+        # 0.1^3 times 0.05 is under 1e-4: there nothing is blended, nor behind, though it would do
+        ([0.9, 0.9, 0.9, 0.95, 0.5], None, 3, 1e-3),
+        ([0.9, 0.9, 0.9, 0.89, 0.5], None, 4, 1.1e-4),
+        # a stop draws the fragment that crosses it, and none behind
+        ([0.5, 0.5, 0.95, 0.5], 1.0, 1, 0.5),
+        ([0.5, 0.5, 0.95, 0.5], 0.26, 2, 0.25),
+        ([0.5, 0.5, 0.95, 0.5], 0.25, 3, 0.0125),
+        ([0.5, 0.5, 0.95, 0.5], 0.0124, 4, 0.00625),
+        ([0.5, 0.5, 0.95, 0.5], 1e-4, 4, 0.00625),
+    ],
 )
-def test_a_pixel_stops_before_the_fragment_that_would_darken_it_too_much(fourth, drawn, left):
-    """0.1^3 times 0.05 is under 1e-4: there nothing is blended, nor behind, though it would do."""
-    inputs = scenes.stack([0.9, 0.9, 0.9, fourth, 0.5], dtype=F64)
-    found = draw(inputs)
-    assert found.fragments[8, 8] == drawn
-    assert found.alpha[0, 8, 8].item() == pytest.approx(1 - left)
-    blended = replace(inputs, splats=gaussians_first(inputs.splats, drawn))
-    assert torch.equal(draw(blended).image[:, 8, 8], found.image[:, 8, 8])
-
-
-@pytest.mark.parametrize(
-    ("stop", "drawn", "left"),
-    [(1.0, 1, 0.5), (0.26, 2, 0.25), (0.25, 3, 0.0125), (0.0124, 4, 0.00625), (1e-4, 4, 0.00625)],
-)
-def test_with_a_stop_a_pixel_draws_the_fragment_that_crosses_it_and_none_behind(stop, drawn, left):
-    inputs = replace(scenes.stack([0.5, 0.5, 0.95, 0.5], dtype=F64), stop=stop)
+def test_a_pixel_ends_where_little_light_is_left(opacities, stop, drawn, left):
+    inputs = replace(scenes.stack(opacities, dtype=F64), stop=stop)
     found = draw(inputs)
     assert found.fragments[8, 8] == drawn
     assert found.alpha[0, 8, 8].item() == pytest.approx(1 - left)

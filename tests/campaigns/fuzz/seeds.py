@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from finetune import tiny
+from miniatures.vanilla_3dgs import HOST
 from PIL import Image
 from plyfile import PlyData
 
@@ -26,24 +27,6 @@ from fragprune_plugins.workbench.models.formats.spz import zstd
 
 CORPUS = Path(__file__).parent / "corpus"
 """Of what was found, in a folder for each reader."""
-
-_RENDERER = b"""import math
-
-import torch
-from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer
-
-from scene.gaussian_model import GaussianModel
-
-
-def render(viewpoint_camera, pc: GaussianModel, pipe, bg_color, scaling_modifier=1.0):
-    rasterizer = GaussianRasterizer(
-        raster_settings=GaussianRasterizationSettings(
-            tanfovx=math.tan(viewpoint_camera.FoVx * 0.5), bg=bg_color, debug=pipe.debug
-        )
-    )
-    image, radii = rasterizer(means3D=pc.get_xyz, opacities=pc.get_opacity, shs=pc.get_features)
-    return {"render": image, "visibility_filter": (radii > 0).nonzero(), "radii": radii}
-"""
 
 _LENSES = b"""7 OPENCV 32 32 36 36 16 16 -0.1 0.02 0.001 0.002
 8 SIMPLE_RADIAL_FISHEYE 32 32 36 16 16 0.03
@@ -259,7 +242,7 @@ def good() -> dict[str, dict[str, bytes]]:
             "settings": {"a.toml": _SETTINGS},
             "checkpoint": {"a.pth": _checkpoint(folder)},
             "progress": {"a.safetensors": _progress(folder)},
-            "source": {"renderer.py": _RENDERER},
+            "source": {"renderer.py": (HOST / "gaussian_renderer/__init__.py").read_bytes()},
             "git": {"head": b"ref: refs/heads/main\n", "commit": b"0123456789abcdef" * 2 + b"\n"},
             "config": {"a.json": b'{"iterations": 30000, "source_path": "scene", "lambda": 0.2}'},
             "cfg_args": {"a.txt": _ARGUMENTS},
