@@ -393,7 +393,7 @@ void load_losses(const Camera<float>& c, const Losses& from, const Splat* splats
     sums[0] = sums[0] + light * r, sums[1] = sums[1] + light * g, sums[2] = sums[2] + light * b;
   }
   for (int k = 0; k < 3; k++) by_background[k] = sum(sums[k]);
-  for (int i = 0; i < kPixels; i++) {
+  for (int i = 0; from.stop > 0 && i < kPixels; i++) {
     if (kept.transmittance[i] >= from.stop || kept.stop[i] == 0) continue;  // 0: outside the image
     const Splat& last = splats[tile.list[kept.stop[i] - 1]];
     const Brush<float>& is = last.brush;
