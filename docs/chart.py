@@ -40,7 +40,7 @@ def draw(held: list[tuple[str, float, float, float]], ink: str, chart: Path) -> 
         axes.set_yticks(range(len(held)), [name for name, *_ in held])
         axes.invert_yaxis()
         axes.axvline(1, linewidth=1, color="0.5")
-        axes.set_xlim(0, 4.5)
+        axes.set_xlim(0, 5.5)
         axes.set_title(
             "Beside the bars: PSNR against the same training without pruning", loc="left"
         )
