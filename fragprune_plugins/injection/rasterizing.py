@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.constants import NEUTRAL_LOGIT
-from fragprune_plugins.errors import AlignmentError, SessionError, UsageError, log
+from fragprune_plugins.errors import AlignmentError, InputError, SessionError, UsageError, log
 from fragprune_plugins.hosts.dialect import HostCall
 from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
 from fragprune_plugins.injection.proofs import proved
@@ -24,7 +24,7 @@ from fragprune_plugins.injection.stepping import (
     begin_step,
     frozen_parameters,
 )
-from fragprune_plugins.learning.area import area_per_pixel, expect_ellipses
+from fragprune_plugins.learning.area import area_per_pixel
 from fragprune_plugins.learning.goals import Fewer
 from fragprune_plugins.plugins.hooks import drawn_by, thresholds_for
 from fragprune_plugins.types import RasterInputs, RasterOutputs
@@ -232,8 +232,9 @@ def unpack(session: SessionState, call: HostCall) -> tuple[RasterInputs, Draw]:
     engine, rendering = session.engine(call[session.dialect.means].device), session.rendering.get()
     still = rendering is not None and session.standing_still(rendering[0])
     inputs = session.dialect.unpack(replace(call, engine=engine, still=still))
-    if session.settings.goal.on_area:
-        expect_ellipses(inputs.splats)
+    if session.settings.goal.on_area and inputs.splats.flat:
+        found = "surfels (2 scales each), which viewers of 3D Gaussians do not draw"
+        raise InputError("portable", found, "3D Gaussians", "Leave --portable out.")
     return inputs, partial(drawn_by, engine)
 
 

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from fragprune_plugins.constants import FRUSTUM_MARGIN
-from fragprune_plugins.errors import InputError
 from fragprune_plugins.types import Splats
 
 if TYPE_CHECKING:
@@ -65,18 +64,10 @@ def _invert(footprints: Footprints) -> tuple[tuple[Tensor, Tensor, Tensor], Tens
     return cov2d, footprints.means2d.detach(), drawn  # type: ignore[return-value]
 
 
-def expect_ellipses(splats: Splats | Footprints) -> None:
-    """Raise InputError if these are surfels."""
-    if splats.flat:
-        found = "surfels (2 scales each), which viewers of 3D Gaussians do not draw"
-        raise InputError("portable", found, "3D Gaussians", "Leave --portable out.")
-
-
 def project(
     inputs: RasterInputs, splats: Splats
 ) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor, Tensor]:
     """Covariances and means on the image, and whether the Gaussians lie in front of the camera."""
-    expect_ellipses(splats)
     view, means = inputs.view, splats.means.detach()
     points = means @ view.viewmatrix[:3, :3] + view.viewmatrix[3, :3]
     visible = points[:, 2] > inputs.near

@@ -10,7 +10,7 @@ from finetune import tiny
 
 import fragprune_plugins as fp
 from fragprune_plugins import Control, Portable, Schedule, Settings, ThresholdStore, finetune
-from fragprune_plugins.adapting import InputError, RasterInputs, UsageError
+from fragprune_plugins.adapting import RasterInputs, UsageError
 from fragprune_plugins.engines import create_engine
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.learning.pressure import OWN_AREA_PRESSURE, PORTABLE_ELASTICITY
@@ -29,11 +29,11 @@ def area(model, dataset):
     return sum(covered_per_pixel(engine, RasterInputs(s.view, splats)) for s in shots) / len(shots)
 
 
-def test_surfels_have_no_ellipses_to_press_on(tmp_path):
+def test_surfels_are_no_goal_for_other_viewers(tmp_path):
     model = tiny.random_model()
     surfels = replace(model, scaling=model.scaling[:, :2].contiguous())
     dataset = tiny.dataset_in_memory(tmp_path, model)
-    with pytest.raises(InputError, match="portable: surfels"):
+    with pytest.raises(UsageError, match="a portable goal, and surfels"):
         finetune(surfels, dataset, Settings(iterations=1, goal=Portable()))
 
 

@@ -117,6 +117,9 @@ def expect_fit(
             "a model without any: it is for viewers that ignore them",
             "Pass model.untruncated(), or --no-truncation on the command line.",
         )
+    if settings.goal.on_area and model.scaling.shape[1] == 2:
+        found, remedy = "a portable goal, and surfels (2 scales each)", "Choose another goal."
+        raise UsageError("finetune", found, "3D Gaussians, as other viewers draw", remedy)
     if moves and (sharded or not relocates(model, settings)):
         found = "relocate, where positions stay, own pictures teach, or Gaussians are left out"
         expected = "all parameters of a model without 3D filter, learned from photographs"
