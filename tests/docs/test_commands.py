@@ -1,6 +1,6 @@
 """What pages tell to type exists: commands with their options, names in Python, files of ours.
 
-Left out are docs/experiments and CHANGELOG.md: they say what was run then, and what is gone.
+Left out are docs/experiments: they tell what was run then.
 """
 
 import json
@@ -17,7 +17,7 @@ from fragprune_plugins.workbench.commands import cli
 
 ROOT = Path(__file__).parents[2]
 DOCS = [*(ROOT / "docs").rglob("*.md"), *(ROOT / "docs").rglob("*.ipynb")]
-DOCS += [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md")]
+DOCS += [ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md")]
 PAGES = [page for page in sorted(DOCS) if "experiments" not in page.parts]
 CODE = re.compile(r"^```.*?^```|^ {4}.*?$|`[^`]+`", re.MULTILINE | re.DOTALL)
 COMMAND = re.compile(r"(?<![\w/.-])fragprune(?:_plugins)? +(?!as |stop |rim )([a-z][^\n;&|>()`]*)")
