@@ -44,8 +44,8 @@ def command(**options: Any) -> Report:
     Without given cameras, and without those of the training of MODEL, some are generated: from
     outside or from inside, whichever suits the model. The output says which, and why.
 
-    Views and tiles are samples, so that the time is bounded: about a minute for 125,000 Gaussians
-    on two cores, some minutes for a million.
+    Views and tiles are samples, so that the time is bounded: less than a minute for 125,000
+    Gaussians, about two minutes for a million.
 
     \b
     Examples:

@@ -42,7 +42,7 @@ from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 _APPEARANCE = {"f_dc": 0.0025, "f_rest": 0.0025 / 20}
 _GEOMETRY = {"xyz": 1.6e-5, "scaling": 0.005, "rotation": 0.001}
 _LIVELY = 4.0
-"""Times these rates where photographs teach all of a model with dropout, or while Gaussians move:
+"""Times these rates where photographs teach all of a model with dropout, or where Gaussians move:
 docs/results.md. Its own pictures teach worse so: 29.75 dB in place of 29.89 on fox (--self
 --dropout 0.2)."""
 _POSTFIXES = 100  # times in a run that the bar says how it goes
