@@ -45,8 +45,8 @@ RULES = (*learning.LEARNING_APART, rules.Needs("--from-iter", _STAGES, _INSIDE))
 @click.option(
     "--trust",
     is_flag=True,
-    help="Go on where the host's own rasterizer draws otherwise than ours. What nobody proved is "
-    "named on stderr.",
+    help="Go on, with a warning, where the host's own rasterizer draws otherwise than ours, or "
+    "could not be compared with it.",
 )
 @click.option("--again", is_flag=True, help="Train or learn anew, though it is finished.")
 def command(**options: Any) -> Report:
