@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     Figure = float | Tensor
 
 LEAST_PRESSURE = 1e-4  # least by default: overfitted models have next to no loss per fragment
-MOST_PRESSURE = 4e-4  # largest by default; docs/results.md has what that changes
+MOST_PRESSURE = 4e-4  # largest by default; docs/experiments/large-losses.md says why
 
 OWN_PRESSURE = 1.5e-4
 """The default for a model that learns from its own pictures; its loss is next to nothing at first.

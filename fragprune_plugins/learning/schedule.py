@@ -17,12 +17,12 @@ Train = Literal["opacity", "appearance", "all"]
 FINETUNE_ITERATIONS = 5000
 QUICK_ITERATIONS = 1000
 ITERATIONS_MAX = 10**9
-USUAL_STOP = 0.02  # share of a pixel's light; docs/results.md has the runs that chose it
+USUAL_STOP = 0.02  # share of a pixel's light; docs/experiments/defaults.md says why
 
 _DEFAULT_GOAL = Pressure()
 _DECAY = 0.1  # learning rates fall to this share over the run, exponentially
 
-# Where all moves; docs/results.md has the runs that chose these.
+# Where all moves; docs/experiments/defaults.md has the runs that chose these.
 _LEARNING_STEPS = 2000
 """Thresholds learn in the last so many, of one view each: where shapes follow, truncating for
 longer still improves the training views and no longer the others."""

@@ -43,8 +43,8 @@ _APPEARANCE = {"f_dc": 0.0025, "f_rest": 0.0025 / 20}
 _GEOMETRY = {"xyz": 1.6e-5, "scaling": 0.005, "rotation": 0.001}
 _LIVELY = 4.0
 """Times these rates where photographs teach all of a model with dropout, or where Gaussians move:
-docs/results.md. Its own pictures teach worse so: 29.75 dB in place of 29.89 on fox (--self
---dropout 0.2)."""
+docs/experiments/defaults.md. Its own pictures teach worse so: 29.75 dB in place of 29.89 on fox
+(--self --dropout 0.2)."""
 _POSTFIXES = 100  # times in a run that the bar says how it goes
 _LEAST_AREA = 1e-12  # per pixel: a view may show nothing, and has no gradient then
 

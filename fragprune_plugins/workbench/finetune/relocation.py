@@ -25,7 +25,7 @@ from fragprune_plugins.workbench.goals import AtMost
 from fragprune_plugins.workbench.pruning import removal_error
 
 SHARE = 0.15
-"""Of the Gaussians, that move; docs/results.md has the runs that chose this and what follows."""
+"""Of the Gaussians, that move; docs/experiments/defaults.md has the runs that chose all these."""
 
 PACE = 0.02
 """Of its longest axis, that a Gaussian moves in a step at first: what moved has a place to find.

@@ -20,7 +20,7 @@ from fragprune_plugins.workbench.ranks import Ranks
 from fragprune_plugins.workbench.scenes.dataset import Dataset
 
 DROPOUT, KEEP = 0.2, 0.6
-"""What suits a model that knows its photographs by heart; docs/results.md has the runs."""
+"""What suits a model that knows its photographs by heart: docs/experiments/defaults.md."""
 
 BY_HEART = 0.2
 """dB that a model forgets in a trial if it knows its photographs by heart; others 0.05 at most."""
