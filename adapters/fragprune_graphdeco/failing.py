@@ -67,6 +67,7 @@ def reasons(repo: HostRepo, scripts: tuple[str, ...]) -> tuple[str, ...]:
         found += (*_misfits(repo, module), *_absent(repo, module), *_own_options(repo, module))[:1]
         found += [*_of_cameras(repo, module)][:1]
         found += [*_untyped(repo, module)][:1]
+        found += [*_unmade(repo, module)][:1]
         found += [f"{script} draws by {each}" for each in _drawn_elsewhere(repo, module)][:1]
     return tuple(found)
 
@@ -336,6 +337,17 @@ def _own_options(repo: HostRepo, module: str) -> Iterator[str]:
         made = definition_of(repo, module, called)[1]
         if isinstance(made, ast.FunctionDef) and _sets_any(made, skipped(made, known)):
             yield f"sets options by {called}, whatever its command says ({at})"
+
+
+def _unmade(repo: HostRepo, module: str) -> Iterator[str]:
+    """Folders that a script saves into at any iteration, and makes for some iterations alone."""
+    calls = [(each, text_of(each)) for each in every(repo.tree(module), ast.Call)]
+    made = "".join(text for _, text in calls if re.match(r"(os\.)?(makedirs|mkdir)\(", text))
+    for node, text in ((node, text) for node, text in calls if text.startswith("torch.save(")):
+        for name, stem in re.findall(r"((\w+_){\w*})", text):
+            if re.search(rf"\b{stem}\d", made) and f"{stem}{{" not in made:
+                folder = f"{name}, a folder that it makes for iterations of its own alone"
+                yield f"saves into {folder} ({repo.at(module, node.lineno)})"
 
 
 def _untyped(repo: HostRepo, module: str) -> Iterator[str]:

@@ -787,6 +787,11 @@ REFUSED = [
     ("from scene", "import jittor\nfrom scene", "train.py trains by jittor"),
     ("gaussians.oneupSHdegree()", CLAMPS, "changes _opacity outside"),
     (STEPS, f"        if iteration < 9:\n    {STEPS}", "optimizer steps only where iteration < 9"),
+    (
+        PARSES,
+        f'\nmakedirs("net_7000")\ntorch.save(net, "net_{{}}".format(opt.iterations))\n{PARSES}',
+        "saves into net_{}, a folder that it makes for iterations of its own alone (train.py:",
+    ),
     ("projmatrix=0", "projmatrix=view.intrinsics", "is view.intrinsics"),
     (STATEMENT, "gaussians.prune(mask)", "calls prune, which GaussianModel lacks (train.py:"),
     (STATEMENT, "scene.shuffle()", "calls shuffle, which Scene lacks (train.py:"),
