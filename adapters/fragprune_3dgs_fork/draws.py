@@ -24,7 +24,7 @@ from fragprune_graphdeco import (
     syntax,
     text_of,
 )
-from fragprune_plugins.adapting import nodes
+from fragprune_plugins.adapting import Function, nodes
 
 _MODEL_ARGUMENTS = ("pc", "gaussians", "gaussian", "model")
 NEUTRAL = {"antialiasing", "confidence", "projmatrix_raw"}
@@ -81,9 +81,29 @@ def read_draws(fork: Fork) -> None:
         for cut in [*source.cuts()][:1]:
             refuse(f"a picture of more channels, {text_of(cut)}", "a picture")
         fork.colours |= source.colours
+        fork.options |= _moved_by(fork, body)
     if not fork.draws and not any(each.code == "rasterizer-call" for each in fork.findings):
         at = f"{RENDERER} ({repo.place(RENDERER, 'render')})"
         fork.refuse("rasterizer-call", at, "no drawing function that a script calls", "render")
+
+
+def _moved_by(fork: Fork, body: Function) -> set[str]:
+    """Options, off by default, that scripts hand to a drawing function, and under which it draws
+    other Gaussians than its model's own.
+    """
+    calls = [each for tree in fork.trees.values() for each in every(tree, ast.Call)]
+    takes = fork.repo.parameters(RENDERER, body.name) or ()
+    drawing = [syntax.passed(each, takes) for each in calls if text_of(each.func) == body.name]
+    given = {key: value for each in drawing for key, value in each.items() if not is_off(value)}
+    asked = {key: getattr(value, "attr", "") for key, value in given.items()}
+    options = {k: v for k, v in asked.items() if reading.off_in(fork.repo, fork.command, v)}
+
+    def others(*on: str) -> list[str]:
+        drawn = Drawing(fork.repo, RENDERER, body, on=(*(given.keys() - options.keys()), *on))
+        return [why for why, moves in drawn.shapes() if not moves]
+
+    off = options.keys() & off_by_default(body)
+    return {options[key] for key in off if others(key) != others()}
 
 
 def _reached(fork: Fork, node: ast.AST) -> Iterator[str]:

@@ -471,6 +471,22 @@ def test_a_drawing_function_for_an_option_that_is_off_is_not_reached(tmp_path, s
             ForkAdapter().refuse(repo, [word], stage="auto", device="cuda")
 
 
+def test_an_option_under_which_a_drawing_function_draws_more_gaussians_is_refused(tmp_path):
+    grows = "    if grown:\n        means3D = torch.cat((means3D, pc.get_children))\n    shs ="
+    flag = 'parser.add_argument("--{}", action="store_true")\n    '
+    repo = fork(
+        tmp_path,
+        ("chosen=None):", "chosen=None, grown=False, told=False):"),
+        ("    shs =", grows),
+        ("pipe, background)", "pipe, background, grown=opt.grown, told=opt.told)"),
+        ("    for name in ", f"    {flag.format('grown')}{flag.format('told')}for name in "),
+    )
+    assert errors(repo) == []
+    ForkAdapter().refuse(repo, ["--told"], stage="auto", device="cuda")
+    with pytest.raises(UsageError, match="other draws"):
+        ForkAdapter().refuse(repo, ["--grown"], stage="auto", device="cuda")
+
+
 def test_of_several_scripts_those_are_served_that_can_be(tmp_path):
     fork(tmp_path, script="training/train.py")
     text = (tmp_path / "training/train.py").read_text()
