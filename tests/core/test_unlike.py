@@ -105,3 +105,13 @@ def test_a_camera_may_change_what_it_sees(tmp_path, change):
         f"class Camera:\n    def __init__(self):\n        self.{change}\n"
     )
     assert why(tmp_path).startswith("its cameras change what they see")
+
+
+@pytest.mark.parametrize("name", ["'pose'", "'cam_' + str(uid)", "f'camera_{uid}'"])
+def test_cameras_that_a_training_moves_see_other_pictures(tmp_path, name):
+    group = f"{{'params': [self.P], 'lr': 0.1, 'name': {name}}}"
+    why(tmp_path)
+    text = (tmp_path / "train.py").read_text()
+    (tmp_path / "train.py").write_text(f"{text}\nadam = Adam([{group}])\n")
+    found = unlike(HostRepo(tmp_path), ["train"])
+    assert found.startswith("its training may move its cameras, the group ")
