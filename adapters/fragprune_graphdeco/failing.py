@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import builtins
+import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -52,6 +53,7 @@ def reasons(repo: HostRepo, scripts: tuple[str, ...]) -> tuple[str, ...]:
     if saver and saver.name != "save_ply" and ".save_ply(" not in text_of(saver):
         found.append(f"Scene.save writes its PLY by {saver.name}, which saves no thresholds")
     found += [*_left_out(repo, scripts), *_of_scene(repo), *_of_authors(repo)][:1]
+    found += [*panoramas(repo)][:1]
     for script in scripts:
         module = module_of(script)
         tree, home = repo.tree(module), home_of(repo, module)
@@ -227,6 +229,17 @@ def _of_scene(repo: HostRepo) -> Iterator[str]:
         if owner == "self.gaussians" and _lacks(model, name, texts):
             at = repo.at("scene", node.lineno)
             yield f"its scene calls {name}, which GaussianModel lacks ({at})"
+
+
+def panoramas(repo: HostRepo) -> Iterator[str]:
+    """Cameras that a reader makes with an angle that no plane can show: panoramas."""
+    module = "scene.dataset_readers"
+    words = [each for call in every(repo.tree(module), ast.Call) for each in call.keywords]
+    for each in (each for each in words if each.arg in ("FovX", "FovY")):
+        angle = getattr(each.value, "value", 0)
+        if isinstance(angle, int | float) and angle > math.pi:
+            at = repo.at(module, each.lineno)
+            yield f"its cameras are no pinholes, {each.arg}={angle} ({at})"
 
 
 def _of_authors(repo: HostRepo) -> Iterator[str]:

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import lru_cache
 
-from fragprune_graphdeco import reading, saved
+from fragprune_graphdeco import failing, reading, saved
 from fragprune_graphdeco.call import RASTERIZER
 from fragprune_graphdeco.drawing import Drawing, arguments, drawing_in
 from fragprune_graphdeco.kernels import DISTANCE, ORDER, SPLAT, read_kernels
@@ -60,6 +60,7 @@ def read_plain(repo: HostRepo) -> Plain:
         *getters,
         *_of_columns(model),
         *(() if flat else _of_kernel(repo)),
+        *failing.panoramas(repo),
         *drawn,
         *saved.values(model),
         *saved.activations(model),

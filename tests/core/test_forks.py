@@ -1373,3 +1373,14 @@ def test_a_scene_that_another_method_saves_keeps_thresholds_if_it_goes_through_s
     )
     found = "; ".join(errors(HostRepo(tmp_path)))
     assert ("by save_fused_ply, which saves no thresholds" in found) == (not through)
+
+
+@pytest.mark.parametrize(
+    ("angle", "runs"), [("360", False), ("np.pi", True), ("fov", True), ("1.5", True)]
+)
+def test_cameras_that_see_all_around_are_refused(tmp_path, angle, runs):
+    repo, reader = fork(tmp_path), tmp_path / "scene/dataset_readers.py"
+    reader.write_text(f"info = CameraInfo(uid=1, FovX={angle})\n")
+    found = f"its cameras are no pinholes, FovX={angle} (scene/dataset_readers.py:1)"
+    assert errors(repo) == [] if runs else found in str(errors(repo))
+    assert (found in plain.read_plain(repo).reasons) == (not runs)
