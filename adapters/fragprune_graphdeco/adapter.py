@@ -18,7 +18,7 @@ from fragprune_graphdeco.call import CallInSource, RasterizerCall, drawing_funct
 from fragprune_graphdeco.drawing import Drawing, pictures
 from fragprune_graphdeco.kernels import SPLAT, Kernel, read_kernels, vendored
 from fragprune_graphdeco.reading import mentions, module_of
-from fragprune_graphdeco.syntax import entries, every, text_of
+from fragprune_graphdeco.syntax import assigned, entries, every, text_of
 from fragprune_plugins.adapting import (
     CHECKPOINT_KEY,
     GROUPS,
@@ -256,6 +256,7 @@ class GraphdecoAdapter(ScriptAdapter):
             or a name in the module of the model.
         scripts: paths of training scripts in the checkout, the usual one first.
         optimizer: the host's, by its name in ``torch.optim``.
+        beside: further optimizers that its scripts make, and whose values it restores.
         undrawn_flags: flags with which our readers draw other pictures.
         resumes_ply: a checkpoint that it can resume can be made from its PLY.
         flags: fields of ``CommandLine`` that differ from those of vanilla.
@@ -275,6 +276,7 @@ class GraphdecoAdapter(ScriptAdapter):
     own_names: tuple[str, ...] = ()
     scripts: tuple[str, ...] = ("train.py",)
     optimizer = "Adam"
+    beside: tuple[str, ...] = ()
     densifies_until: tuple[str, ...] = ("densify_until_iter",)
     filtered = False
     resumes_ply = True
@@ -300,6 +302,10 @@ class GraphdecoAdapter(ScriptAdapter):
             rate = [] if self.steps_by_rendering or not made else ["update_learning_rate"]
             called = mentions(repo, [module_of(script)], rate)
             missing += [f"{script} calls no {each}" for each in rate if each not in called]
+            pairs = assigned(repo.tree(module_of(script)))
+            own = [text_of(to) for to, value in pairs if failing.OPTIMIZER.match(text_of(value))]
+            own = [each for each in own if each.isidentifier() and each not in self.beside]
+            missing += [f"{script} does not resume what {each} trains" for each in own]
         both = (repo.function(MODEL, f"GaussianModel.{name}") for name in ("capture", "restore"))
         missing += filter(None, [reading.uneven(*both)])
         for module, _, name in (each.rpartition(":") for each in self.own_names):

@@ -76,6 +76,7 @@ class RT4DGS(GraphdecoAdapter):
         "skipped": 2,  # iterations start at 2, and the last one takes no step
     }
     resumes_ply = False
+    beside = ("env_map_optimizer",)
     undrawn = (
         "checkpoints of Gaussians in time for models, and no PLY",
         "Read the PSNR that the host prints at its test_iterations.",

@@ -278,3 +278,12 @@ def test_scripts_that_draw_by_gsplat_and_attach_no_model_are_a_host_of_their_own
     with pytest.raises(UnknownHostError):
         locate(HostRepo(tmp_path), [Gsplat()])
     assert looked_at == ["gsplat"] * bool(more)
+
+
+@pytest.mark.parametrize("script", ["made = torch.optim.Adam([])", "gaussians.own = Adam([])"])
+def test_another_optimizer_of_its_script_begins_anew_where_it_resumes(tmp_path, script):
+    repo = skeleton(tmp_path)
+    with (tmp_path / "train.py").open("a") as train:
+        train.write(f"\n\ndef water(opt):\n    {script}\n")
+    found = [each.found for each in Vanilla3DGS().match(repo).findings]
+    assert ("train.py does not resume what made trains" in found) == ("made" in script)

@@ -267,11 +267,11 @@ def training(dataset, opt, pipe):
     if args.start_checkpoint:
         model_params, iteration = torch.load(args.start_checkpoint)
         gaussians.restore(model_params, opt)
-    size, optimizer = pipe.env_map_res, None
+    size, env_map_optimizer = pipe.env_map_res, None
     gaussians.env_map = None
     if size:
         gaussians.env_map = torch.nn.Parameter(torch.zeros(3, size, size))
-        optimizer = torch.optim.Adam([gaussians.env_map], lr=opt.feature_lr)
+        env_map_optimizer = torch.optim.Adam([gaussians.env_map], lr=opt.feature_lr)
     cameras = scene.getTrainCameras()
     views = [Timed(view, timestamp=number / len(cameras)) for number, view in enumerate(cameras)]
     background = torch.zeros(3)
@@ -316,9 +316,9 @@ def training(dataset, opt, pipe):
                 if iteration < opt.iterations:
                     gaussians.optimizer.step()
                     gaussians.optimizer.zero_grad(set_to_none=True)
-                    if optimizer:
-                        optimizer.step()
-                        optimizer.zero_grad(set_to_none=True)
+                    if env_map_optimizer:
+                        env_map_optimizer.step()
+                        env_map_optimizer.zero_grad(set_to_none=True)
 
 
 SAVE = """    def save(self, iteration):
