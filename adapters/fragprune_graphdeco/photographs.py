@@ -78,9 +78,9 @@ def _of_script(repo: HostRepo, script: str) -> Iterator[str]:
             for node in (each for each in every(function, ast.BinOp) if each not in gone):
                 weights = [e for e in (node.left, node.right) if _MASK.search(text_of(e))]
                 pairs = [pair for pair in _compared(function) if pair[0] in nodes(node)]
-                if isinstance(node.op, ast.Mult) and len(weights) == 1 and pairs:
-                    kinds = [_kinds(function, each, gone) for each in pairs[0][1]]
-                    if {"drawn", "photograph"} <= set.union(*kinds):
+                if isinstance(node.op, ast.Mult) and len(weights) == 1:
+                    each_of = [[_kinds(function, e, gone) for e in sides] for _, sides in pairs]
+                    if any({"drawn", "photograph"} <= set.union(*each) for each in each_of):
                         at = repo.at(module, node.lineno)
                         what = text_of(weights[0])[:40]
                         yield f"its training weighs what it compares, {what} ({at})"

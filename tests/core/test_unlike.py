@@ -70,9 +70,11 @@ def test_another_picture_is_compared(tmp_path, written, compared):
     assert why(tmp_path, **written).startswith(f"its training compares {compared} (train.py:")
 
 
-def test_a_mask_beside_the_comparison_leaves_parts_of_photographs_out(tmp_path):
-    found = why(tmp_path, loss="(torch.abs(image - gt_image) * static_mask).mean()")
-    assert found.startswith("its training weighs what it compares, static_mask (train.py:")
+@pytest.mark.parametrize("mask", ["static_mask", "(1.0 - mask)"])
+def test_a_mask_beside_the_comparison_leaves_parts_of_photographs_out(tmp_path, mask):
+    found = why(tmp_path, loss=f"({mask} * torch.abs(image - gt_image)).mean()")
+    weight = mask.strip("()")
+    assert found.startswith(f"its training weighs what it compares, {weight} (train.py:")
 
 
 @pytest.mark.parametrize(("default", "compared"), [("False", ""), ("True", "image with gt_image")])
