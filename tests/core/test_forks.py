@@ -569,14 +569,14 @@ NOT_RESUMED = {
         "gaussians.restore(torch.load(checkpoint), opt)",
         "state, at = torch.load(checkpoint)\n        gaussians.restore(state)\n        at = 0",
     ),
-    "a lost parameter": ("self.poses)", "self.masks)"),
+    "a lost parameter": ("self.ground)", "self.masks)"),
     "more than is taken back": (
         "training_setup(training_args)\n\n    def construct",
         "training_setup(training_args)\n        self._xyz, rest = model_args\n\n    def construct",
     ),
     "a set": (
-        "(self._xyz, self._scaling, *values, self.optimizer.state_dict(), self.poses)",
-        "{self._xyz, self._scaling, *values, self.optimizer.state_dict(), self.poses}",
+        "(self._xyz, self._scaling, *values, self.optimizer.state_dict(), self.ground)",
+        "{self._xyz, self._scaling, *values, self.optimizer.state_dict(), self.ground}",
     ),
     "a dict": ("((gaussians.capture(), iteration)", '({"model": gaussians.capture(), "at": 1}'),
     "a removed folder": ("scene = Scene(", "shutil.rmtree(opt.model_path); scene = Scene("),
@@ -584,8 +584,8 @@ NOT_RESUMED = {
     "a network beside": (SETUP, SETUP + ADAM),
     "a network of other weights": (SETUP, f"{SETUP}    net.load_state_dict(weights)\n{ADAM}"),
     "a call that fails": ("setup(training_args)", "setup(training_args, 1)"),
-    "a lost network": ('"params": [self.poses]', '"params": self.net.parameters()'),
-    "a whole network": ('"params": [self.poses]', '"params": self.poses.parameters()'),
+    "a lost network": ('"params": [self.ground]', '"params": self.net.parameters()'),
+    "a whole network": ('"params": [self.ground]', '"params": self.ground.parameters()'),
     "an import in its first iterations": (
         "\n        loss.backward()",
         "\n        if iteration < 4:\n            import cv2\n        loss.backward()"

@@ -27,7 +27,7 @@ class GaussianModel:
 
     def capture(self):
         values = (self._features_dc, self._features_rest, self._opacity, self._rotation)
-        return (self._xyz, self._scaling, *values, self.optimizer.state_dict(), self.poses)
+        return (self._xyz, self._scaling, *values, self.optimizer.state_dict(), self.ground)
 
     def restore(self, model_args, training_args):
         self.training_setup(training_args)
@@ -47,7 +47,7 @@ class GaussianModel:
             {"params": [self._scaling], "name": "scaling"},
             {"params": [self._rotation], "name": "rotation"},
             {"params": [self._features_rest], "name": "f_rest"},
-            {"params": [self.poses], "name": "pose"},
+            {"params": [self.ground], "name": "ground"},
         ]
         self.optimizer = torch.optim.Adam(groups)
 
