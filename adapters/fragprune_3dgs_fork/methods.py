@@ -17,7 +17,7 @@ from fragprune_3dgs_fork.fork import (
     methods_of,
     while_densifying,
 )
-from fragprune_graphdeco import assigned, every, failing, is_off, mentioned, reading, text_of
+from fragprune_graphdeco import assigned, every, is_off, mentioned, reading, text_of
 from fragprune_plugins.adapting import Finding, HostRepo
 
 PARAMETERS = {"_xyz", "_features_dc", "_features_rest", "_opacity", "_scaling", "_rotation"}
@@ -139,7 +139,7 @@ def read_changes(fork: Fork) -> None:
         owners = reading.owners(trained)
         for node in every(trained, ast.Assign, ast.Call):
             at = fork.repo.at(module, node.lineno)  # type: ignore[attr-defined]
-            if isinstance(node, ast.Assign) and failing.OPTIMIZER.match(text_of(node.value)):
+            if isinstance(node, ast.Assign) and reading.OPTIMIZER.match(text_of(node.value)):
                 name = text_of(node.targets[0])
             elif isinstance(node, ast.Call) and text_of(node.func).endswith("optimizer.step"):
                 name = text_of(node.func).removesuffix(".step")

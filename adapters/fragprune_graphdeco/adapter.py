@@ -303,7 +303,7 @@ class GraphdecoAdapter(ScriptAdapter):
             called = mentions(repo, [module_of(script)], rate)
             missing += [f"{script} calls no {each}" for each in rate if each not in called]
             pairs = assigned(repo.tree(module_of(script)))
-            own = [text_of(to) for to, value in pairs if failing.OPTIMIZER.match(text_of(value))]
+            own = [text_of(to) for to, value in pairs if reading.OPTIMIZER.match(text_of(value))]
             own = [each for each in own if each.isidentifier() and each not in self.beside]
             missing += [f"{script} does not resume what {each} trains" for each in own]
         both = (repo.function(MODEL, f"GaussianModel.{name}") for name in ("capture", "restore"))

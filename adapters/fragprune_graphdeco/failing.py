@@ -35,8 +35,6 @@ from fragprune_graphdeco.syntax import (
 )
 from fragprune_plugins.adapting import HostRepo, imported, nodes
 
-OPTIMIZER = re.compile(r"(torch\.)?(optim\.)?\w*(Adam|SGD|RMSprop)\w*\(")
-"""A call that makes an optimizer."""
 _RASTERIZES = "GaussianRasterizer("
 _ELSEWHERE = re.compile(r"\w+(?:\.\w+)*\.(?:scene(?:\.\w+)*|gaussian_renderer)")
 

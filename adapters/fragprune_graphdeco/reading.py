@@ -34,6 +34,8 @@ from fragprune_plugins.adapting import (
 
 MODEL = "scene.gaussian_model"  # where 3DGS defines its model
 GETTERS = ("xyz", "opacity", "scaling", "rotation")
+OPTIMIZER = re.compile(r"(torch\.)?(optim\.)?\w*(Adam|SGD|RMSprop)\w*\(")
+"""A call that makes an optimizer."""
 """Values of a model that its properties give, by the names of their parameters."""
 _SHAPES = {"repeat", "expand", "view", "reshape", "squeeze", "unsqueeze", "contiguous"}
 """Methods that change how often or in what shape a value stands, not the value."""

@@ -286,4 +286,5 @@ def test_another_optimizer_of_its_script_begins_anew_where_it_resumes(tmp_path, 
     with (tmp_path / "train.py").open("a") as train:
         train.write(f"\n\ndef water(opt):\n    {script}\n")
     found = [each.found for each in Vanilla3DGS().match(repo).findings]
-    assert ("train.py does not resume what made trains" in found) == ("made" in script)
+    lost = ["train.py does not resume what made trains"] if "made" in script else []
+    assert [each for each in found if "does not resume" in each] == lost
