@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import fragprune_graphdeco as graphdeco
+from fragprune_3dgs_fork.holding import HoldingAdapter
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall, every, text_of
 from fragprune_plugins.adapting import (
     Finding,
@@ -58,7 +59,7 @@ class SurfelDialect(GraphdecoDialect):
         return outputs.image, outputs.radii, torch.where(outputs.alpha > 0, maps, 0.0)
 
 
-class SurfelSplatting(GraphdecoAdapter):
+class SurfelSplatting(HoldingAdapter):
     """The adapter of 2D Gaussian Splatting."""
 
     name = "2dgs"

@@ -395,6 +395,10 @@ class ForkAdapter(GraphdecoAdapter):
                 raise UsageError(name, why, served, "Prune its PLY: fragprune finetune.")
         return self
 
+    def options(self, repo: HostRepo) -> frozenset[str]:
+        """Those that were read."""
+        return read_fork(repo).options
+
     def refuse(self, repo: HostRepo, arguments: list[str], *, stage: str, device: str) -> None:
         """Refuse trained exposures, which checkpoints of 3DGS lack, and joint learning where our
         gradient on the screen is another.
@@ -402,18 +406,8 @@ class ForkAdapter(GraphdecoAdapter):
         Raises:
             UsageError: these, or an option under which it draws or changes its model otherwise.
         """
-        fork, parser = read_fork(repo), ArgumentParser(add_help=False, allow_abbrev=False)
-        for name in fork.options:
-            parser.add_argument(f"--{name}", nargs="?", const="", action="append")
-        given = vars(parser.parse_known_args(arguments)[0])
-        for name, values in ((name, values) for name, values in given.items() if values):
-            if any(value != fork.default(name) for value in values):
-                raise UsageError(
-                    f"--{name}",
-                    "other draws, values of the rasterizer, changes of the model, or options",
-                    f"what was read of {', '.join(fork.scripts)}, without it",
-                    "Leave it out, or prune its PLY: fragprune finetune.",
-                )
+        super().refuse(repo, arguments, stage=stage, device=device)
+        fork = read_fork(repo)
         if stage == "joint" and fork.scaled:
             raise UsageError(
                 "--stage joint",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from functools import partial
 
 import fragprune_graphdeco as graphdeco
@@ -45,6 +45,9 @@ def read_draws(fork: Fork) -> None:
     drawn = {name: body for name, body in pairs if body}
     while more := {n for name in drawn.keys() & named for n in mentioned(drawn[name])} - named:
         named |= more
+    for node, options in fork.optional.items():
+        if {getattr(node, kind, "") for kind in ("id", "attr", "name")} & {*functions} - named:
+            fork.options |= options
     bodies = {name: body for name, body in drawn.items() if name in named}
     trees = (*fork.trees.values(), *bodies.values())
     called = {getattr(n, "id", getattr(n, "attr", "")) for each in trees for n in nodes(each)}
@@ -54,8 +57,8 @@ def read_draws(fork: Fork) -> None:
         at = f"{RENDERER}:{name} ({repo.place(RENDERER, name)})"
         refuse = partial(fork.refuse, "rasterizer-call", at)
         calls = tuple(graphdeco.read_calls(repo, RENDERER, name))
-        others = [each for each in parameters if each != model]
-        camera = next((each for each in others if CAMERA.match(each)), next(iter(others), ""))
+        further = [each for each in parameters if each != model]
+        camera = next((each for each in further if CAMERA.match(each)), next(iter(further), ""))
         if not model or not camera or parameters.index(model) < parameters.index(camera):
             refuse(f"arguments {', '.join(parameters)}", "a camera and a model")
             continue
@@ -71,39 +74,38 @@ def read_draws(fork: Fork) -> None:
             made = " ".join(map(text_of, source.values.get(blended, [])))
             if blended not in filled and re.search(r"torch\.(zeros|empty)\(", made):
                 refuse(f"{blended}, which is empty unless asked for", "channels of every Gaussian")
-        for node in every(body, ast.Call) if name in called else ():
-            if "means3D" in arguments(node):
-                other = Drawing(repo, RENDERER, body, call=node)
-                for found in (why for why, moves in other.shapes() if not moves):
-                    refuse(found, "the model's own Gaussians")
-                if selected := other.selection():
-                    refuse(f"draws a selection, {selected}", "all rows")
+        others, moving = _others(fork, body)
+        for found in others if name in called else ():
+            refuse(found, "the model's own Gaussians, all of them")
         for cut in [*source.cuts()][:1]:
             refuse(f"a picture of more channels, {text_of(cut)}", "a picture")
         fork.colours |= source.colours
-        fork.options |= _moved_by(fork, body)
+        fork.options |= moving
     if not fork.draws and not any(each.code == "rasterizer-call" for each in fork.findings):
         at = f"{RENDERER} ({repo.place(RENDERER, 'render')})"
         fork.refuse("rasterizer-call", at, "no drawing function that a script calls", "render")
 
 
-def _moved_by(fork: Fork, body: Function) -> set[str]:
-    """Options, off by default, that scripts hand to a drawing function, and under which it draws
-    other Gaussians than its model's own.
+def _others(fork: Fork, body: Function) -> tuple[list[str], set[str]]:
+    """How a drawing function draws other Gaussians than all of its model's own, and the options,
+    off by default, that scripts hand to it and under which it does.
     """
-    calls = [each for tree in fork.trees.values() for each in every(tree, ast.Call)]
-    takes = fork.repo.parameters(RENDERER, body.name) or ()
-    drawing = [syntax.passed(each, takes) for each in calls if text_of(each.func) == body.name]
-    given = {key: value for each in drawing for key, value in each.items() if not is_off(value)}
+    given = graphdeco.given_to(body, fork.trees.values())
     asked = {key: getattr(value, "attr", "") for key, value in given.items()}
     options = {k: v for k, v in asked.items() if reading.off_in(fork.repo, fork.command, v)}
 
-    def others(*on: str) -> list[str]:
-        drawn = Drawing(fork.repo, RENDERER, body, on=(*(given.keys() - options.keys()), *on))
-        return [why for why, moves in drawn.shapes() if not moves]
+    always = given.keys() - options.keys()
+    calls = [each for each in every(body, ast.Call) if "means3D" in arguments(each)]
 
-    off = options.keys() & off_by_default(body)
-    return {options[key] for key in off if others(key) != others()}
+    def drawn(shaped: Collection[str], chosen: Collection[str]) -> list[str]:
+        made = partial(Drawing, fork.repo, RENDERER, body)
+        shapes = (each for call in calls for each in made(call=call, on=shaped).shapes())
+        found = [why for why, moves in shapes if not moves]
+        return found + [each for call in calls for each in made(call=call, on=chosen).selected()]
+
+    off, usual = options.keys() & off_by_default(body), drawn(always, always)
+    moving = {options[key] for key in off if drawn(*2 * ({*always, key},)) != usual}
+    return drawn((), always), moving
 
 
 def _reached(fork: Fork, node: ast.AST) -> Iterator[str]:
@@ -112,11 +114,8 @@ def _reached(fork: Fork, node: ast.AST) -> Iterator[str]:
         if isinstance(name := getattr(node, kind, None), str):
             yield name
     for each in ast.iter_child_nodes(node):
-        if each in fork.optional:
-            if not mentioned(each).isdisjoint(fork.drawing):
-                fork.options |= fork.optional[each]
-            continue
-        yield from _reached(fork, each)
+        if each not in fork.optional:
+            yield from _reached(fork, each)
 
 
 def _check_call(fork: Fork, at: str, function: str, call: graphdeco.CallInSource) -> None:

@@ -76,11 +76,6 @@ class Fork:
         """The tree of a script."""
         return self.repo.tree(reading.module_of(script)) or ast.Module([], [])
 
-    def default(self, option: str) -> str | None:
-        """An option's default, as a command gives it; None if it is not known."""
-        known = reading.by_default_of(self.repo, self.command, option)
-        return str(known[0]) if known else None
-
     def refuse(self, code: str, where: str, found: str, expected: str) -> None:
         """Add an error."""
         self.findings.append(Finding.error(code, where, found, expected))
@@ -125,8 +120,7 @@ class Fork:
         pairs = (pair for each in own for pair in assigned(each))
         made = _SET | {to.attr for to, _ in pairs if isinstance(to, ast.Attribute)}
         for tree in self.trees.values():
-            once = failing.bindings(tree)
-            called = {n: v for to, v in assigned(tree) if once[n := getattr(to, "id", "")] == 1}
+            called = failing.named_once(tree)
             known = reading.as_options(self.repo, self.command, called)
             skipped = syntax.skipped(tree, known)
             named = {each: reading.options_of(each, known, called) for each in {*skipped.values()}}

@@ -32,6 +32,8 @@ _PARAMETER = re.compile(
     rf"(.+)\.({'|'.join(sorted(PARAMETERS))})(\.(?!grad\b|requires_grad\b)\w+|\[.*\])*"
 )
 """A parameter of a model, or a part of it."""
+_GRADIENT = re.compile(rf"self\.({'|'.join(sorted(PARAMETERS))})\.grad[.\[]")
+"""A parameter's gradient, which stage 2 does not compute."""
 _IN_PLACE = re.compile(r".+\.(?!_|requires_grad)\w+_", re.DOTALL)
 """A method that changes values in place."""
 _MODELS = re.compile(r"\b(gaussians?|pc|model)$")
@@ -80,6 +82,16 @@ def read_methods(fork: Fork) -> None:
             else:
                 at = fork.repo.at(module, node.lineno)
                 fork.refuse("row-change", at, f"reads what {name} returns", "a statement")
+    texts = ((name, text_of(body)) for name, body in methods.items() if name not in changing)
+    graded = {name for name, text in texts if _GRADIENT.search(text) and ".grad is " not in text}
+    for module, tree in fork.trees.items():
+        calls = ((node, name) for node, name in method_calls(tree) if name in graded)
+        for node, name in calls:
+            if node in fork.optional:
+                fork.options |= fork.optional[node]
+            elif node not in fork.early:
+                at = fork.repo.at(module, node.lineno)
+                fork.refuse("row-change", at, f"{name} reads gradients of the model", "none")
     fork.still = tuple(name for name in methods if name in still)
     fork.relocating = frozenset(name for name in still if RELOCATES in called.get(name, ()))
     save = methods.get("save_ply", ast.Pass())

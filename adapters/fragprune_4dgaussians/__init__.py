@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from fragprune_3dgs_fork.holding import HoldingAdapter
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall, model_seam
 from fragprune_plugins.adapting import (
     ConfigFile,
@@ -106,7 +107,7 @@ def is_fine(call: SeamCall) -> bool:
     return "fine" in call.arguments["stage"]
 
 
-class MovingGaussians(GraphdecoAdapter):
+class MovingGaussians(HoldingAdapter):
     """The adapter of 4DGaussians."""
 
     name = "4dgaussians"

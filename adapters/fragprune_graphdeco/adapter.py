@@ -6,6 +6,7 @@ import ast
 import contextlib
 import logging
 import re
+from argparse import ArgumentParser
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from fragprune_graphdeco import failing, photographs, reading
 from fragprune_graphdeco.call import CallInSource, RasterizerCall, drawing_functions, read_calls
-from fragprune_graphdeco.drawing import Drawing, pictures
+from fragprune_graphdeco.drawing import Drawing, arguments, given_to, pictures
 from fragprune_graphdeco.kernels import SPLAT, Kernel, read_kernels, vendored
 from fragprune_graphdeco.reading import mentions, module_of
 from fragprune_graphdeco.syntax import assigned, entries, every, text_of
@@ -39,6 +40,7 @@ from fragprune_plugins.adapting import (
     Seam,
     SeamCall,
     Splats,
+    UsageError,
     View,
     replacing,
 )
@@ -327,11 +329,16 @@ class GraphdecoAdapter(ScriptAdapter):
         """An error for each input of the rasterizer that is made of other values."""
         module, accepted = self._accepted()
         values = ", ".join(("the values of 3DGS", *self.drawn_from))
-        found = []
+        found, scripts = [], map(module_of, self.scripts_of(repo))
+        trees = reading.reached(repo, scripts, RENDERER).values()
         names = dict.fromkeys(each.function for each in accepted)
         for name, body in ((name, repo.function(module, name)) for name in names):
             if body is None:
                 continue
+            on = given_to(body, trees) if self.dialect_type.rows_drawn is Dialect.rows_drawn else ()
+            for call in (each for each in every(body, ast.Call) if on and arguments(each)):
+                chosen = Drawing(repo, module, body, self.drawn_from, call, on).selected()
+                found += [(name, each, "all rows") for each in chosen]
             drawn = Drawing(repo, module, body, self.drawn_from)
             found += [(name, reason, f"a drawing of {values}") for reason, _ in drawn.inputs()]
             cuts = [f"a picture of more channels, {text_of(each)}" for each in drawn.cuts()]
@@ -425,6 +432,31 @@ class GraphdecoAdapter(ScriptAdapter):
             in_full=partial(reading.in_full, repo),
         )
         return replace(line, **self.flags)
+
+    def options(self, repo: HostRepo) -> frozenset[str]:
+        """Options, off by default, under which its scripts do otherwise than was read."""
+        modules = map(module_of, self.command_line(repo).scripts)
+        return frozenset().union(*(failing.overruling(repo, each) for each in modules))
+
+    def refuse(self, repo: HostRepo, arguments: list[str], *, stage: str, device: str) -> None:
+        """Refuse an option under which scripts do otherwise than was read, by UsageError."""
+        parser = ArgumentParser(add_help=False, allow_abbrev=False)
+        for name in self.options(repo):
+            parser.add_argument(f"--{name}", nargs="?", const="", action="append")
+        given, scripts = (
+            vars(parser.parse_known_args(arguments)[0]),
+            self.command_line(repo).scripts,
+        )
+        modules = ("arguments", *map(module_of, scripts))
+        for name, values in ((name, values) for name, values in given.items() if values):
+            known = reading.by_default_of(repo, modules, name)
+            if any([value] != [*map(str, known)] for value in values):
+                raise UsageError(
+                    f"--{name}",
+                    "other draws, values of the rasterizer, changes of the model, or options",
+                    f"what was read of {', '.join(scripts)}, without it",
+                    "Leave it out, or prune its PLY: fragprune finetune.",
+                )
 
     def densified(self, repo: HostRepo, script: Path, arguments: list[str]) -> int | None:
         """The latest of those of ``densifies_until`` that the source has, with its defaults."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 
 from fragprune_graphdeco import reading
 from fragprune_graphdeco.call import ARGUMENTS, read_calls
@@ -84,6 +84,14 @@ def drawing_in(repo: HostRepo, module: str) -> list[ast.FunctionDef]:
     last = {each.name: each for each in body if isinstance(each, ast.FunctionDef)}
     found = [each for each in last.values() if _call(each)]
     return sorted(found, key=lambda each: (each.name != "render", not pictures(each)))
+
+
+def given_to(function: Function, trees: Iterable[ast.AST]) -> dict[str, ast.expr]:
+    """What code gives a drawing function by its parameters, without what is off."""
+    takes = [each.arg for each in function.args.args]
+    calls = (each for tree in trees for each in every(tree, ast.Call))
+    named = (passed(each, takes) for each in calls if text_of(each.func) == function.name)
+    return {key: value for each in named for key, value in each.items() if not is_off(value)}
 
 
 def _call(function: ast.AST, known: Known = lambda _: []) -> ast.Call | None:
@@ -284,8 +292,8 @@ class Drawing:
         own = [each.attr for each in given if re.fullmatch(r"self\.\w+", text_of(each))]  # type: ignore[attr-defined]
         return own if own and len(own) == len(given) else [name]
 
-    def selection(self) -> str:
-        """The code that picks rows of what is drawn first, as ``means3D[mask]``; "" without any."""
+    def selected(self) -> list[str]:
+        """That it draws a selection, with the code that picks rows first, as ``means3D[mask]``."""
         gone = skipped(self.function, self._known)  # by what is off
         given = {} if self.call in gone else self.arguments
         own, seen = f"{self.model}.get_xyz", set()
@@ -296,8 +304,8 @@ class Drawing:
                     seen.add(node.id)
                     waiting += self.values.get(node.id, [])
                 elif (of := chosen(node)) and own in self._roots(of):
-                    return text_of(node)[:60]
-        return ""
+                    return [f"draws a selection, {text_of(node)[:60]}"]
+        return []
 
     def reasons(self) -> Iterator[tuple[str, bool]]:
         """Why the picture is not that of the PLY, and whether its rows are drawn all the same."""

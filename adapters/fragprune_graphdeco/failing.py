@@ -9,11 +9,13 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache
+from typing import Any
 
 from fragprune_graphdeco.reading import (
     MODEL,
     ModelClass,
     as_options,
+    by_default_of,
     definition_of,
     home_of,
     learning,
@@ -70,6 +72,7 @@ def reasons(repo: HostRepo, scripts: tuple[str, ...]) -> tuple[str, ...]:
         found += [*_of_cameras(repo, module)][:1]
         found += [*_untyped(repo, module)][:1]
         found += [*_unmade(repo, module)][:1]
+        found += [f"{script} {why}" for why, asked in _ends(repo, module) if not asked][:1]
         found += [f"{script} draws by {each}" for each in _drawn_elsewhere(repo, module)][:1]
     return tuple(found)
 
@@ -337,19 +340,28 @@ def _own_options(repo: HostRepo, module: str) -> Iterator[str]:
     """Options that a script sets whatever its command says: one of ours, or all that a file has."""
     tree = repo.tree(module)
     known = as_options(repo, ("arguments", module))
-    for node in _started(getattr(tree, "body", ())):
+    gone = skipped(tree, known)
+    functions = {n for f in every(tree, ast.FunctionDef) for n in _started(f.body) if n not in gone}
+    for node in (*_started(getattr(tree, "body", ())), *functions):
         at = repo.at(module, node.lineno)
-        if isinstance(node, ast.For) and _sets_any(node, skipped(tree, known)):
+        if isinstance(node, ast.For) and node not in functions and _sets_any(node, gone):
             yield f"sets options by {text_of(node.iter)}, whatever its command says ({at})"
         if not isinstance(node, ast.Assign):
             continue
-        name = getattr(node.targets[0], "attr", "")
-        if name in _OURS and f".{name}" not in text_of(node.value):
+        name = _overruled(node)
+        if name and (name == "iterations" or node not in functions):
             yield f"sets {name} itself, whatever its command says ({at})"
         called = getattr(getattr(node.value, "func", None), "id", "")
         made = definition_of(repo, module, called)[1]
         if isinstance(made, ast.FunctionDef) and _sets_any(made, skipped(made, known)):
             yield f"sets options by {called}, whatever its command says ({at})"
+
+
+def _overruled(node: ast.AST) -> str:
+    """The option of ours that a statement sets to what is not made of it; "" if it sets none."""
+    to = node.targets[0] if isinstance(node, ast.Assign) else None
+    name = to.attr if isinstance(to, ast.Attribute) and text_of(to.value) != "self" else ""
+    return name if name in _OURS and f".{name}" not in text_of(node.value) else ""  # type: ignore[attr-defined]
 
 
 def _unmade(repo: HostRepo, module: str) -> Iterator[str]:
@@ -389,19 +401,66 @@ def _started(body: Iterable[ast.stmt]) -> Iterator[ast.stmt]:
 
 
 def overruling(repo: HostRepo, module: str) -> frozenset[str]:
-    """Options, off by default, under which a script sets others, or their defaults."""
+    """Options, off by default, under which a script ends early, or sets others or defaults."""
     tree, known = repo.tree(module), as_options(repo, ("arguments", module))
     imports = every(tree, ast.ImportFrom)
     homes = {each.name: repo.absolute(module, node) for node in imports for each in node.names}
-    found = frozenset[str]()
+    found = frozenset[str]().union(*(asked for _, asked in _ends(repo, module)))
     for node, test in skipped(tree, known).items():
         called = getattr(node, "func", None)
         name = getattr(called, "id", "")
         made = repo.function(homes.get(name, module), name) if name else None
         defaults = getattr(called, "attr", "") == "set_defaults"
-        if name == "setattr" or defaults or (made and _sets_any(made, {})):
+        sets = name == "setattr" or defaults or _overruled(node)
+        if sets or (made and _sets_any(made, {})):
             found |= options_of(test, known)
     return found
+
+
+@lru_cache(maxsize=64)  # of the adapters, many ask
+def _ends(repo: HostRepo, module: str) -> list[tuple[str, frozenset[str]]]:
+    """Where a training ends before its last iteration, by what it measures, and the options, off by
+    default, that ask for this.
+    """
+    tree, modules = repo.tree(module), ("arguments", module)
+    named = named_once(tree)
+    known, found = as_options(repo, modules, named), []
+    loops: tuple[Any, ...] = every(tree, ast.For, ast.While)
+    training = (each.body for each in loops if "backward(" in text_of(each))
+    for node, tests in (each for body in training for each in _leaving(body)):
+        asks = " and ".join(map(text_of, tests))
+        if tests and not re.search(r"iterations\b|nan\b|finite", asks):
+            read = {name for each in tests for name in options_of(each, known, named)}
+            off = {name for name in read if not by_default_of(repo, modules, name)[0]}
+            place = f"{text_of(tests[-1])[:60]} ({repo.at(module, node.lineno)})"
+            found.append((f"may end before its last iteration, where {place}", frozenset(off)))
+    return found
+
+
+def _leaving(
+    body: Iterable[ast.stmt], tests: tuple[ast.expr, ...] = ()
+) -> Iterator[tuple[ast.stmt, tuple[ast.expr, ...]]]:
+    """What leaves a loop, of its body, and the tests before each."""
+    for node in body:
+        if isinstance(node, ast.Break | ast.Return) or re.match(r"(sys\.)?exit\(", text_of(node)):
+            yield node, tests
+        elif not isinstance(node, ast.For | ast.While | ast.FunctionDef):
+            asked = (*tests, node.test) if isinstance(node, ast.If) else tests
+            for part in ("body", "orelse", "finalbody"):
+                yield from _leaving(getattr(node, part, ()), asked)
+
+
+def named_once(tree: ast.AST | None) -> dict[str, ast.expr]:
+    """What a script gives a name, if it gives that once: also the values with which it calls a
+    function once, by the names of its parameters.
+    """
+    once = bindings(tree)
+    pairs = [(getattr(to, "id", ""), value) for to, value in assigned(tree)]
+    for function in every(tree, ast.FunctionDef):
+        calls = [n for n in every(tree, ast.Call) if getattr(n.func, "id", "") == function.name]
+        names = [each.arg for each in function.args.args]
+        pairs += [*passed(calls[0], names).items()] if len(calls) == 1 else []
+    return {name: value for name, value in pairs if once[name] == 1}
 
 
 def _sets_any(tree: ast.AST, gone: Mapping[ast.AST, ast.expr]) -> bool:

@@ -185,8 +185,10 @@ def as_options(
 
     def also(node: ast.AST) -> list[Any]:
         value = named.get(getattr(node, "id", ""))
-        taken = decided(value, known) if value else None
-        return known(node) if taken is None else [taken]
+        if value is None:
+            return known(node)
+        taken = decided(value, known)
+        return known(value) or ([] if taken is None else [taken])
 
     return also
 

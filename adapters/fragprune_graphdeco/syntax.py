@@ -95,12 +95,25 @@ def skipped(tree: ast.AST | None, known: Known) -> dict[ast.AST, ast.expr]:
     """What code does not do by the values that are known: nodes, with the test before each."""
     found: dict[ast.AST, ast.expr] = {}
     branching: tuple[Any, ...] = every(tree, ast.If, ast.IfExp)
+    after = _after(tree) if branching else {}
     for node in branching:
         taken = decided(node.test, known)
         branch = None if taken is None else node.orelse if taken else node.body
-        for each in branch if isinstance(branch, list) else [branch]:
+        unreached = branch if isinstance(branch, list) else [branch]
+        for each in (*unreached, *(after.get(node, ()) if taken else ())):
             found |= dict.fromkeys(nodes(each), node.test)
     return found
+
+
+def _after(tree: ast.AST | None) -> dict[ast.AST, list[ast.stmt]]:
+    """What follows each branch that ends with a return."""
+    blocks = (block for node in nodes(tree) if isinstance(block := getattr(node, "body", 0), list))
+    return {
+        node: block[number + 1 :]
+        for block in blocks
+        for number, node in enumerate(block)
+        if isinstance(node, ast.If) and isinstance(node.body[-1], ast.Return)
+    }
 
 
 def decided(test: ast.expr, known: Known) -> bool | None:

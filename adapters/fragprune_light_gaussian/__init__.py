@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from fragprune_3dgs_fork.holding import HoldingAdapter
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall, model_seam
 from fragprune_plugins.adapting import HostCall, HostInfo, HostRepo, RasterOutputs, Role, Seam
 
@@ -39,7 +40,7 @@ class LightGaussianDialect(GraphdecoDialect):
         return made
 
 
-class LightGaussian(GraphdecoAdapter):
+class LightGaussian(HoldingAdapter):
     """The adapter of LightGaussian."""
 
     name = "light-gaussian"
@@ -58,6 +59,7 @@ class LightGaussian(GraphdecoAdapter):
     )
     dialect_type = LightGaussianDialect
     scripts = (TRAIN, PRUNE, DISTIL)
+    kept = ("onedownSHdegree",)
     flags = {"continues": (PRUNE, DISTIL)}
     optimizer = "AdamW"
     densifies_until = ("densify_until_iter", "prune_iterations")

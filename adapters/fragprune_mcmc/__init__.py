@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import fragprune_graphdeco as graphdeco
+from fragprune_3dgs_fork.holding import HoldingAdapter
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall, model_seam
 from fragprune_plugins.adapting import ConfigFile, HostInfo, Role, revised
 
@@ -21,7 +22,7 @@ class MCMCDialect(GraphdecoDialect):
     returned = ("image", "radii", "is_used")  # the last is passed on and never read
 
 
-class MCMC(GraphdecoAdapter):
+class MCMC(HoldingAdapter):
     """The adapter of 3DGS-MCMC."""
 
     name = "mcmc"

@@ -15,6 +15,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import fragprune_graphdeco as graphdeco
+from fragprune_3dgs_fork.holding import HoldingAdapter
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall, model_seam
 from fragprune_plugins.adapting import (
     HostCall,
@@ -79,7 +80,7 @@ def packed(call: SeamCall) -> tuple[Path, Tensor] | None:
     return path, torch.from_numpy(given[0] if given else call.result["arr_0"])
 
 
-class MiniSplatting(GraphdecoAdapter):
+class MiniSplatting(HoldingAdapter):
     """The adapter of Mini-Splatting and Mini-Splatting-D."""
 
     name = "mini-splatting"

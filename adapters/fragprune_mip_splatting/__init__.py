@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import fragprune_graphdeco as graphdeco
+from fragprune_3dgs_fork.holding import HoldingAdapter
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall, model_seam
 from fragprune_plugins.adapting import HostCall, HostInfo, HostRepo, RasterInputs, Role
 
@@ -39,7 +40,7 @@ class MipDialect(GraphdecoDialect):
         )
 
 
-class MipSplatting(GraphdecoAdapter):
+class MipSplatting(HoldingAdapter):
     """The adapter of Mip-Splatting."""
 
     name = "mip-splatting"

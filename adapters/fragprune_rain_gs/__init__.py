@@ -11,6 +11,7 @@ from argparse import ArgumentParser
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from fragprune_3dgs_fork.holding import HoldingAdapter
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall
 from fragprune_plugins.adapting import (
     HostCall,
@@ -47,7 +48,7 @@ class RainDialect(GraphdecoDialect):
         return replace(super().unpack(call), dilation=float(call.settings.low_pass))
 
 
-class RainGS(GraphdecoAdapter):
+class RainGS(HoldingAdapter):
     """The adapter of RAIN-GS."""
 
     name = "rain-gs"

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from fragprune_3dgs_fork.holding import HoldingAdapter
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall, model_seam
 from fragprune_plugins.adapting import (
     EngineError,
@@ -58,7 +59,7 @@ class SpeedySplatDialect(GraphdecoDialect):
         return outputs.image, outputs.radii, took
 
 
-class SpeedySplat(GraphdecoAdapter):
+class SpeedySplat(HoldingAdapter):
     """The adapter of Speedy-Splat."""
 
     name = "speedy-splat"

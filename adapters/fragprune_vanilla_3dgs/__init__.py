@@ -115,6 +115,10 @@ class Vanilla3DGS(GraphdecoAdapter):
         served = [each for each in found if each.code != "param-groups"]
         return served + [Finding.error(*about, each, steps) for each in what]
 
+    def options(self, repo: HostRepo) -> frozenset[str]:
+        """Those of a fork that was read, but for the optimizer, which is known."""
+        return read_fork(repo).options - {"optimizer_type"}
+
     def _state(self, repo: HostRepo) -> Finding:
         """A finding that names the revision; an error if it has no checkpoints."""
         names = ("training_setup", "capture", "restore")

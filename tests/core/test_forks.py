@@ -684,6 +684,38 @@ def test_a_command_that_names_a_file_which_overrules_it_is_refused(tmp_path):
             ForkAdapter().refuse(repo, ["--config", "a.json"], stage="auto", device="cpu")
 
 
+PATIENT = "\n        if {}:\n            break\n        loss.backward()"
+PRESET = (
+    "\n\ndef preset(args):\n    if not args.patience:\n        return\n    args.iterations = 9\n\n"
+)
+IMPATIENT = {
+    "that it measures": (PATIENT.format("opt.patience and worse > opt.patience"), ""),
+    "given by another name": (PATIENT.format("most > 0 and worse > most"), ""),
+    "of something made by it": (
+        PATIENT.format("stops.now(loss)"),
+        "    stops = Stops(opt.patience)\n",
+    ),
+    "by a length of its own": ("\n        loss.backward()", PRESET),
+}
+
+
+@pytest.mark.parametrize("what", IMPATIENT)
+def test_an_option_by_which_a_training_ends_early_is_refused(tmp_path, what):
+    ends, before = IMPATIENT[what]
+    flags = "\nparser.add_argument('--patience', default=0)\ntraining(opt, None, opt.patience)\n"
+    repo = fork(
+        tmp_path,
+        ("\n        loss.backward()", ends),
+        ("(opt, checkpoint):", "(opt, checkpoint, most):"),
+        (PARSES, f"{before if before == PRESET else ''}{flags}{PARSES}"),
+        (LOOP, f"{'' if before == PRESET else before}{LOOP}"),
+    )
+    assert errors(repo) == []
+    ForkAdapter().refuse(repo, ["--patience", "0"], stage="auto", device="cpu")
+    with pytest.raises(UsageError, match="--patience"):
+        ForkAdapter().refuse(repo, ["--patience", "7"], stage="auto", device="cpu")
+
+
 MOVED = [
     ("pc, pipe, bg_color", "pc, pipe, bg_color, d_xyz, d_scaling"),
     ("pipe, background)", "pipe, background, d_xyz, d_scaling)"),
@@ -814,6 +846,13 @@ REFUSED = [
     ("if iteration < opt", f"rows = {STATEMENT}\n        if opt", "reads what thin_out"),
     ('"name": "scaling"', '"name": "size"', "no group scaling"),
     ("(viewpoint_camera, pc,", "(viewpoint_camera, xyz,", "a camera and a model"),
+    ("pipe, background)", "pipe, background, chosen=mask)", "selection, means3D[chosen]"),
+    (LOOP, f"    opt.iterations = 1000\n{LOOP}", "train.py: sets iterations itself"),
+    (
+        "        loss.backward()",
+        "        loss.backward()\n        if worse > 3:\n            break",
+        "train.py may end before its last iteration, where worse > 3 (train.py:",
+    ),
     ("image, radii = rasterizer(", "both = rasterizer(", "not unpacked"),
     ("image, radii = rasterizer(", "return rasterizer(", "not unpacked"),
     ("return self._xyz\n", "return self.net()\n", "computed"),
@@ -821,7 +860,13 @@ REFUSED = [
 GIVES = "    def posed(self):\n        return self.x, self.y\n\n    def capture"
 NET = "class Net(torch.nn.Module):\n    def forward(self):\n        return x, y, z\n\n\nclass Gauss"
 TURNED = "        self.net = Net().cuda()\n\n    def posed(self):\n        return self.net()\n"
+RESTS = "    def rest(self):\n        self._xyz.grad[0] = 0\n\n    def capture"
 REFUSED_TOGETHER = [
+    (
+        {},
+        [("    def capture", RESTS), ("gaussians.oneupSHdegree()", "gaussians.rest()")],
+        "rest reads gradients of the model",
+    ),
     (
         {},
         [("    def capture", GIVES), (STATEMENT, "a, b, c = gaussians.posed()")],

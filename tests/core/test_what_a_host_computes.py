@@ -6,6 +6,7 @@ from miniatures.skeletons import skeleton
 
 from fragprune_2dgs import SurfelSplatting
 from fragprune_graphdeco.kernels import SPLAT, read_kernels, vendored
+from fragprune_plugins.adapting import Role, UsageError
 from fragprune_plugins.errors import UnknownHostError
 from fragprune_plugins.hosts.choosing import locate
 from fragprune_plugins.hosts.source import HostRepo
@@ -346,6 +347,44 @@ def test_a_drawing_of_other_values_than_the_adapter_states_is_refused(tmp_path):
     assert "render makes means3D from pc.posed, not from its PLY alone" in errors(posed)[0]
     stated = type("Posed", (Vanilla3DGS,), {"drawn_from": ("posed",)})
     assert not errors(posed, stated)
+
+
+def test_rows_that_a_named_host_picks_where_its_scripts_ask_for_it_are_refused(tmp_path):
+    picks = "means3D=pc.get_xyz[override_color]"
+    repo = rewritten(skeleton(tmp_path), "gaussian_renderer/__init__.py", "means3D=1", picks)
+    assert not any("selection" in each for each in errors(repo, SurfelSplatting))
+    repo = rewritten(
+        repo, "train.py", "import render\n", "import render\nrender(1, pc=2, override_color=3)\n"
+    )
+    assert "draws a selection, pc.get_xyz[override_color]" in str(errors(repo, SurfelSplatting))
+
+
+FADES = """
+def training(args):
+    gaussians = GaussianModel(3)
+    for iteration in range(9):
+        gaussians.fade()
+        loss.backward()
+        {}
+            gaussians._xyz.add_(1)
+"""
+
+
+def test_what_a_fork_of_a_named_host_changes_stands_still(tmp_path):
+    noisy = "parser.add_argument('--noisy', action='store_true')\n"
+    repo = rewritten(skeleton(tmp_path), "train.py", "\ndef report", f"{noisy}{FADES}\ndef report")
+    model = tmp_path / "scene/gaussian_model.py"
+    model.write_text(f"{model.read_text()}\n    def fade(self): self._opacity = 0\n")
+    asked = rewritten(repo, "train.py", "        {}", "        if args.noisy:")
+    still = [
+        each.attribute for each in SurfelSplatting().seams_for(asked) if each.role is Role.STILL
+    ]
+    assert still[-1] == "GaussianModel.fade"
+    assert not any("changes _xyz" in each for each in errors(asked, SurfelSplatting))
+    with pytest.raises(UsageError, match="--noisy"):
+        SurfelSplatting().refuse(asked, ["--noisy"], stage="auto", device="cpu")
+    always = rewritten(repo, "train.py", "if args.noisy:", "if True:")
+    assert any("changes _xyz outside" in each for each in errors(always, SurfelSplatting))
 
 
 @pytest.mark.parametrize("kind", ["scaling", "rotation"])
