@@ -28,7 +28,10 @@ _CHANGES = re.compile(
     re.IGNORECASE,
 )
 """Statements by which a camera changes its photograph, or the angles that it was taken with."""
-_POSES = re.compile(r"\{'params': .*'name': (f?'(pose|cam(era)?s?)(_\w*)?\W.*)\}")
+_POSES = re.compile(
+    r"\{'params': .*'name': (f?'(?:pose|cam(?:era)?s?)(?:_\w*)?\W.*)\}"
+    r"|\{'params': \[?((?:view\w*|cam\w*)\.\w+)\W.*\}"
+)
 """A group of an optimizer that moves cameras."""
 _KEEPS = {
     *("clamp", "clip", "contiguous", "cuda", "detach", "float", "permute", "squeeze", "to"),
@@ -60,10 +63,11 @@ def _of_script(repo: HostRepo, script: str) -> Iterator[str]:
     """``unlike`` of a script and what it imports; nothing if none of that learns."""
     why, learns, known = NOT_FOUND, False, reading.as_options(repo, ("arguments", script))
     for module, tree in reading.reached(repo, [script]).items():
-        for group in every(tree, ast.Dict):
-            if moves := _POSES.fullmatch(text_of(group)):
-                at = repo.at(module, group.lineno)
-                yield f"its training may move its cameras, the group {moves[1]} ({at})"
+        for node in every(tree, ast.Dict):
+            if moves := _POSES.fullmatch(text_of(node)):
+                at = repo.at(module, node.lineno)
+                group = moves[1] or moves[2]
+                yield f"its training may move its cameras, the group {group} ({at})"
         for function in reading.learning(tree):
             learns, gone = True, skipped(function, known)
             for node, sides in (pair for pair in _compared(function) if pair[0] not in gone):

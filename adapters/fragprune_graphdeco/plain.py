@@ -38,7 +38,9 @@ def read_models(repo: HostRepo) -> list[Plain]:
         model = read_plain(HostRepo(repo.root / each))
         reasons = [why for why in model.reasons if not saves or why != _UNSAVED]
         reasons += dict(_moved(HostRepo(repo.root / each), repo))
-        models.append(replace(model, folder=each, reasons=tuple(reasons)))
+        above = not reasons and _UNSAVED in model.reasons  # what trains it lies above
+        differs = unlike(repo, reading.training_modules(repo)) if above else model.unlike
+        models.append(replace(model, folder=each, reasons=tuple(reasons), unlike=differs))
     beside = not _own_renderers(repo) and any(each.model for each in models)
     if beside:  # what was found by itself is that of a folder
         own = Plain(own.reasons or (_ABSENT,))

@@ -109,11 +109,19 @@ def test_a_camera_may_change_what_it_sees(tmp_path, change):
     assert why(tmp_path).startswith("its cameras change what they see")
 
 
-@pytest.mark.parametrize("name", ["'pose'", "'cam_' + str(uid)", "f'camera_{uid}'"])
-def test_cameras_that_a_training_moves_see_other_pictures(tmp_path, name):
-    group = f"{{'params': [self.P], 'lr': 0.1, 'name': {name}}}"
+@pytest.mark.parametrize(
+    "group",
+    [
+        *(
+            f"'params': [self.P], 'name': {n}"
+            for n in ("'pose'", "'cam_' + str(u)", "f'camera_{u}'")
+        ),
+        "'params': [viewpoint.turned], 'lr': 0.1, 'name': f'turn_{u}'",
+    ],
+)
+def test_cameras_that_a_training_moves_see_other_pictures(tmp_path, group):
     why(tmp_path)
     text = (tmp_path / "train.py").read_text()
-    (tmp_path / "train.py").write_text(f"{text}\nadam = Adam([{group}])\n")
+    (tmp_path / "train.py").write_text(f"{text}\nadam = Adam([{{{group}}}])\n")
     found = unlike(HostRepo(tmp_path), ["train"])
     assert found.startswith("its training may move its cameras, the group ")
