@@ -7,7 +7,7 @@ import contextlib
 import logging
 import re
 from argparse import ArgumentParser
-from collections.abc import Callable, Hashable, Iterable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -19,7 +19,7 @@ from fragprune_graphdeco.call import CallInSource, RasterizerCall, drawing_funct
 from fragprune_graphdeco.drawing import Drawing, arguments, given_to, pictures
 from fragprune_graphdeco.kernels import SPLAT, Kernel, read_kernels, vendored
 from fragprune_graphdeco.reading import mentions, module_of
-from fragprune_graphdeco.syntax import assigned, entries, every, text_of
+from fragprune_graphdeco.syntax import assigned, entries, every, skipped, text_of
 from fragprune_plugins.adapting import (
     CHECKPOINT_KEY,
     GROUPS,
@@ -304,9 +304,7 @@ class GraphdecoAdapter(ScriptAdapter):
             rate = [] if self.steps_by_rendering or not made else ["update_learning_rate"]
             called = mentions(repo, [module_of(script)], rate)
             missing += [f"{script} calls no {each}" for each in rate if each not in called]
-            pairs = assigned(repo.tree(module_of(script)))
-            own = [text_of(to) for to, value in pairs if reading.OPTIMIZER.match(text_of(value))]
-            own = [each for each in own if each.isidentifier() and each not in self.beside]
+            own = [name for name, asked in self._optimizers(repo, script) if not asked]
             missing += [f"{script} does not resume what {each} trains" for each in own]
         both = (repo.function(MODEL, f"GaussianModel.{name}") for name in ("capture", "restore"))
         missing += filter(None, [reading.uneven(*both)])
@@ -324,6 +322,17 @@ class GraphdecoAdapter(ScriptAdapter):
             *self._calls(repo),
             *self._drawn(repo),
         ]
+
+    def _optimizers(self, repo: HostRepo, script: str) -> Iterator[tuple[str, frozenset[str]]]:
+        """Further optimizers that a script makes, and the options, if any, that ask for each."""
+        tree, modules = repo.tree(module_of(script)), ("arguments", module_of(script))
+        known = reading.as_options(repo, modules)
+        gone = skipped(tree, known)
+        for name, value in ((text_of(to), value) for to, value in assigned(tree)):
+            found = reading.OPTIMIZER.match(text_of(value)) and name not in self.beside
+            if found and name.isidentifier():
+                asked = reading.options_of(gone[value], known) if value in gone else frozenset()
+                yield name, asked
 
     def _drawn(self, repo: HostRepo) -> list[Finding]:
         """An error for each input of the rasterizer that is made of other values."""
@@ -435,8 +444,10 @@ class GraphdecoAdapter(ScriptAdapter):
 
     def options(self, repo: HostRepo) -> frozenset[str]:
         """Options, off by default, under which its scripts do otherwise than was read."""
-        modules = map(module_of, self.command_line(repo).scripts)
-        return frozenset().union(*(failing.overruling(repo, each) for each in modules))
+        scripts = self.command_line(repo).scripts
+        further = [asked for each in scripts for _, asked in self._optimizers(repo, each)]
+        sets = (failing.overruling(repo, module_of(each)) for each in scripts)
+        return frozenset().union(*sets, *further)
 
     def refuse(self, repo: HostRepo, arguments: list[str], *, stage: str, device: str) -> None:
         """Refuse an option under which scripts do otherwise than was read, by UsageError."""

@@ -393,8 +393,11 @@ class Drawing:
         if isinstance(value, ast.Compare | ast.UnaryOp):
             return whole
         if isinstance(value, ast.BinOp):
-            behind = isinstance(value.op, ast.Add) and _ADDED.search(text_of(value.right))
-            return self._made_into(value.left, seen, own) if behind else whole
+            by = text_of(value.right)
+            keeps = isinstance(value.op, ast.Add) and bool(_ADDED.search(by))
+            if own and isinstance(value.op, ast.Mult) and by.startswith("scal"):
+                keeps = getattr(self.defaults.get(by), "value", 0) == 1  # if it is not given
+            return self._made_into(value.left, seen, own) if keeps else whole
         if seen and isinstance(value, ast.Constant) and value.value is not None:
             return whole
         if own and text_of(value) in (f"{of_model}_scaling", f"{of_model}_opacity"):

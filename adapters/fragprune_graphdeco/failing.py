@@ -401,8 +401,12 @@ def _started(body: Iterable[ast.stmt]) -> Iterator[ast.stmt]:
 
 
 def overruling(repo: HostRepo, module: str) -> frozenset[str]:
-    """Options, off by default, under which a script ends early, or sets others or defaults."""
-    tree, known = repo.tree(module), as_options(repo, ("arguments", module))
+    """Options, off by default, under which a script ends early, or sets others or defaults, or
+    another checkpoint.
+    """
+    tree = repo.tree(module)
+    named = named_once(tree)
+    known = as_options(repo, ("arguments", module), named)
     imports = every(tree, ast.ImportFrom)
     homes = {each.name: repo.absolute(module, node) for node in imports for each in node.names}
     found = frozenset[str]().union(*(asked for _, asked in _ends(repo, module)))
@@ -411,10 +415,15 @@ def overruling(repo: HostRepo, module: str) -> frozenset[str]:
         name = getattr(called, "id", "")
         made = repo.function(homes.get(name, module), name) if name else None
         defaults = getattr(called, "attr", "") == "set_defaults"
-        sets = name == "setattr" or defaults or _overruled(node)
+        to = text_of(node.targets[0]) if isinstance(node, ast.Assign) else ""
+        sets = name == "setattr" or defaults or _overruled(node) or to in _RESUMED
         if sets or (made and _sets_any(made, {})):
-            found |= options_of(test, known)
+            found |= options_of(test, known, named)
     return found
+
+
+_RESUMED = ("checkpoint", "start_checkpoint")
+"""What scripts call the checkpoint that they resume."""
 
 
 @lru_cache(maxsize=64)  # of the adapters, many ask

@@ -63,11 +63,10 @@ def _of_script(repo: HostRepo, script: str) -> Iterator[str]:
     """``unlike`` of a script and what it imports; nothing if none of that learns."""
     why, learns, known = NOT_FOUND, False, reading.as_options(repo, ("arguments", script))
     for module, tree in reading.reached(repo, [script]).items():
-        for node in every(tree, ast.Dict):
-            if moves := _POSES.fullmatch(text_of(node)):
-                at = repo.at(module, node.lineno)
-                group = moves[1] or moves[2]
-                yield f"its training may move its cameras, the group {group} ({at})"
+        for group in every(tree, ast.Dict):
+            if moves := _POSES.fullmatch(text_of(group)):
+                named, at = moves[1] or moves[2], repo.at(module, group.lineno)
+                yield f"its training may move its cameras, the group {named} ({at})"
         for function in reading.learning(tree):
             learns, gone = True, skipped(function, known)
             for node, sides in (pair for pair in _compared(function) if pair[0] not in gone):

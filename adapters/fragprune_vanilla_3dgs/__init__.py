@@ -110,6 +110,8 @@ class Vanilla3DGS(GraphdecoAdapter):
         what = [f"{name}: {why}" for name, why in trained.items() if name not in usual]
         what += [f"{name}, which changes the model" for name in fork.still if name not in known]
         what += [fork.one_run] if fork.one_run else []
+        given = len(reading.state(repo.function(graphdeco.MODEL, "GaussianModel.capture")))
+        what += [f"capture gives {given} values"] if given not in (0, 12) else []
         about, steps = ("other-host", str(repo.root)), "the steps of 3DGS alone"
         found = ForkAdapter().fingerprint(repo)  # groups were checked: here they need no names
         served = [each for each in found if each.code != "param-groups"]
@@ -117,7 +119,7 @@ class Vanilla3DGS(GraphdecoAdapter):
 
     def options(self, repo: HostRepo) -> frozenset[str]:
         """Those of a fork that was read, but for the optimizer, which is known."""
-        return read_fork(repo).options - {"optimizer_type"}
+        return super().options(repo) | read_fork(repo).options - {"optimizer_type"}
 
     def _state(self, repo: HostRepo) -> Finding:
         """A finding that names the revision; an error if it has no checkpoints."""

@@ -45,6 +45,15 @@ def test_a_changed_host_is_refused_by_what_changed(adapter, file, old, new, foun
     assert any(found in error for error in errors), errors
 
 
+def test_a_checkpoint_of_further_values_is_not_vanillas(tmp_path):
+    path = written(HOSTS["vanilla-3dgs"], tmp_path) / MODEL
+    edit(path, "state_dict(),\n", "state_dict(), self.seed,\n")
+    edit(path, ") = model_args", "seed) = model_args")
+    match = found_adapter("vanilla-3dgs").match(HostRepo(tmp_path))
+    errors = [each.found for each in match.findings if each.level == "error"]
+    assert errors == ["capture gives 13 values"]
+
+
 @pytest.mark.parametrize(
     ("adapter", "script"),
     [("light-gaussian", "distill_train.py"), ("mini-splatting", "ms_d/train.py")],

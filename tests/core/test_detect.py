@@ -3,6 +3,7 @@
 import pytest
 from miniatures.skeletons import FLAGS, GROUPS, SETTINGS, STATES, skeleton
 
+from fragprune_2dgs import SurfelSplatting
 from fragprune_gsplat import Gsplat
 from fragprune_plugins.adapting import HostRepo, Role, Seam, revised
 from fragprune_plugins.errors import UnknownHostError
@@ -280,11 +281,20 @@ def test_scripts_that_draw_by_gsplat_and_attach_no_model_are_a_host_of_their_own
     assert looked_at == ["gsplat"] * bool(more)
 
 
-@pytest.mark.parametrize("script", ["made = torch.optim.Adam([])", "gaussians.own = Adam([])"])
+@pytest.mark.parametrize(
+    "script",
+    [
+        "made = torch.optim.Adam([])",
+        "gaussians.own = Adam([])",
+        "if opt.water:\n        made = torch.optim.Adam([])",
+    ],
+)
 def test_another_optimizer_of_its_script_begins_anew_where_it_resumes(tmp_path, script):
     repo = skeleton(tmp_path)
+    flag = "parser.add_argument('--water', action='store_true')\n"
     with (tmp_path / "train.py").open("a") as train:
-        train.write(f"\n\ndef water(opt):\n    {script}\n")
+        train.write(f"\n\ndef water(opt):\n    {script}\n\n{flag}")
     found = [each.found for each in Vanilla3DGS().match(repo).findings]
-    lost = ["train.py does not resume what made trains"] if "made" in script else []
+    lost = ["train.py does not resume what made trains"] if script.startswith("made") else []
     assert [each for each in found if "does not resume" in each] == lost
+    assert ("water" in SurfelSplatting().options(repo)) == script.startswith("if")

@@ -695,6 +695,10 @@ IMPATIENT = {
         PATIENT.format("stops.now(loss)"),
         "    stops = Stops(opt.patience)\n",
     ),
+    "by which another checkpoint is resumed": (
+        "\n        loss.backward()",
+        "    if most:\n        checkpoint = most\n",
+    ),
     "by a length of its own": ("\n        loss.backward()", PRESET),
 }
 

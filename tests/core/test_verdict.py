@@ -429,6 +429,13 @@ def test_opacities_that_are_dropped_as_training_goes_on_are_no_others(fork):
     assert read_plain(fork(given, trains, ("* pc.dropout", "* dropped(iteration / 1000)")))
 
 
+@pytest.mark.parametrize("usual", [1.0, 0.5])
+def test_scales_times_what_is_1_if_not_given_are_no_others(fork, usual):
+    scaled = ("pc.get_scaling, pc", "pc.get_scaling * scaling_modifier, pc")
+    given = ("override_color=None):", f"override_color=None, scaling_modifier={usual}):")
+    assert bool(read_plain(fork(scaled, given))) == (usual == 1)
+
+
 def test_covariances_to_which_something_is_added_are_others(fork):
     sized = "    def get_covariance(self, size):\n        return cov(size) + 0.1\n\n"
     changes = [
