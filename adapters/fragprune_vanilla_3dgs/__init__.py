@@ -119,7 +119,7 @@ class Vanilla3DGS(GraphdecoAdapter):
 
     def options(self, repo: HostRepo) -> frozenset[str]:
         """Those of a fork that was read, but for the optimizer, which is known."""
-        return super().options(repo) | read_fork(repo).options - {"optimizer_type"}
+        return (super().options(repo) | read_fork(repo).options) - {"optimizer_type"}
 
     def _state(self, repo: HostRepo) -> Finding:
         """A finding that names the revision; an error if it has no checkpoints."""
