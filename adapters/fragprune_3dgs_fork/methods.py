@@ -191,10 +191,16 @@ def _noisy(tree: ast.AST) -> set[ast.AST]:
         fresh = [each for each in values if name not in mentioned(each)]
         return bool(fresh) and all(map(product, fresh))
 
+    def noise(value: ast.expr) -> bool:
+        """Whether such a name is added, or a product with it."""
+        times = isinstance(value, ast.BinOp) and isinstance(value.op, ast.Mult)
+        factors = (value.left, value.right) if times else (value,)  # type: ignore[attr-defined]
+        return any(scaled(getattr(each, "id", "")) for each in factors)
+
     return {
         node
         for node, name in method_calls(tree)
-        if name == "add_" and len(node.args) == 1 and scaled(getattr(node.args[0], "id", ""))
+        if name == "add_" and len(node.args) == 1 and noise(node.args[0])
     }
 
 

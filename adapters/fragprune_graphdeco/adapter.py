@@ -443,11 +443,14 @@ class GraphdecoAdapter(ScriptAdapter):
         return replace(line, **self.flags)
 
     def options(self, repo: HostRepo) -> frozenset[str]:
-        """Options, off by default, under which its scripts do otherwise than was read."""
-        scripts = self.command_line(repo).scripts
-        further = [asked for each in scripts for _, asked in self._optimizers(repo, each)]
-        sets = (failing.overruling(repo, module_of(each)) for each in scripts)
-        return frozenset().union(*sets, *further)
+        """Options, off by default, under which its scripts do otherwise than was read, but for
+        that of a file which is read too.
+        """
+        line = self.command_line(repo)
+        further = [asked for each in line.scripts for _, asked in self._optimizers(repo, each)]
+        sets = (failing.overruling(repo, module_of(each)) for each in line.scripts)
+        known = {line.config.flag.strip("-")} if line.config else set()
+        return frozenset().union(*sets, *further) - known
 
     def refuse(self, repo: HostRepo, arguments: list[str], *, stage: str, device: str) -> None:
         """Refuse an option under which scripts do otherwise than was read, by UsageError."""
