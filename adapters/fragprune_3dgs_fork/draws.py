@@ -71,9 +71,10 @@ def read_draws(fork: Fork) -> None:
             made = " ".join(map(text_of, source.values.get(blended, [])))
             if blended not in filled and re.search(r"torch\.(zeros|empty)\(", made):
                 refuse(f"{blended}, which is empty unless asked for", "channels of every Gaussian")
+        given = {key for key, value in _given(fork, body) if not isinstance(value, ast.Attribute)}
         for node in every(body, ast.Call) if name in called else ():
             if "means3D" in arguments(node):
-                other = Drawing(repo, RENDERER, body, call=node)
+                other = Drawing(repo, RENDERER, body, call=node, on=given)
                 for found in (why for why, moves in other.shapes() if not moves):
                     refuse(found, "the model's own Gaussians")
                 if selected := other.selection():
@@ -87,14 +88,21 @@ def read_draws(fork: Fork) -> None:
         fork.refuse("rasterizer-call", at, "no drawing function that a script calls", "render")
 
 
+def _given(fork: Fork, body: Function) -> Iterator[tuple[str, ast.expr]]:
+    """What scripts hand to a drawing function, also by the name that 3DGS has for it in a test."""
+    takes = fork.repo.parameters(RENDERER, body.name) or ()
+    for call in (n for tree in fork.trees.values() for n in every(tree, ast.Call)):
+        if text_of(call.func) in (body.name, "renderFunc") and call not in fork.optional:
+            several = any(isinstance(each, ast.Starred) for each in call.args)
+            values = syntax.passed(call, () if several else takes)
+            yield from ((key, value) for key, value in values.items() if not is_off(value))
+
+
 def _moved_by(fork: Fork, body: Function) -> set[str]:
     """Options, off by default, that scripts hand to a drawing function, and under which it draws
     other Gaussians than its model's own.
     """
-    calls = [each for tree in fork.trees.values() for each in every(tree, ast.Call)]
-    takes = fork.repo.parameters(RENDERER, body.name) or ()
-    drawing = [syntax.passed(each, takes) for each in calls if text_of(each.func) == body.name]
-    given = {key: value for each in drawing for key, value in each.items() if not is_off(value)}
+    given = dict(_given(fork, body))
     asked = {key: getattr(value, "attr", "") for key, value in given.items()}
     options = {k: v for k, v in asked.items() if reading.off_in(fork.repo, fork.command, v)}
 

@@ -247,9 +247,10 @@ class Drawing:
         """What an expression is made of: "model.x", parameters, and "model" itself."""
         if node is None:
             return
-        if re.match(r"getattr\(\w+, '", text_of(node)):  # the attribute, and what it is without
+        called = text_of(getattr(node, "func", None)) == "getattr"
+        if called and re.match(r"getattr\(\w+, '", text_of(node)):
             of, name, *others = node.args  # type: ignore[attr-defined]
-            yield from (root for each in others for root in self._roots(each))
+            yield from (root for each in others for root in self._roots(each))  # without it
             node = ast.Attribute(of, name.value)
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
             if self.made.get(node.value.id) == (self.model,):
@@ -385,8 +386,9 @@ class Drawing:
         if isinstance(value, ast.Compare | ast.UnaryOp):
             return whole
         if isinstance(value, ast.BinOp):
-            behind = isinstance(value.op, ast.Add) and _ADDED.search(text_of(value.right))
-            return self._made_into(value.left, seen, own) if behind else whole
+            factor = text_of(self.defaults.get(getattr(value.right, "id", "")))
+            same = {ast.Add: _ADDED.search(text_of(value.right)), ast.Mult: factor == "1.0"}
+            return self._made_into(value.left, seen, own) if same.get(type(value.op)) else whole
         if seen and isinstance(value, ast.Constant) and value.value is not None:
             return whole
         if own and text_of(value) in (f"{of_model}_scaling", f"{of_model}_opacity"):

@@ -69,7 +69,7 @@ def reasons(repo: HostRepo, scripts: tuple[str, ...]) -> tuple[str, ...]:
         found += (*_misfits(repo, module), *_absent(repo, module), *_own_options(repo, module))[:1]
         found += [*_of_cameras(repo, module)][:1]
         found += [*_untyped(repo, module)][:1]
-        found += [*_unmade(repo, module)][:1]
+        found += [*_unmade(repo, module), *_into_none(repo, module)][:1]
         found += [f"{script} draws by {each}" for each in _drawn_elsewhere(repo, module)][:1]
     return tuple(found)
 
@@ -219,16 +219,22 @@ def _lacks(model: ast.AST | None, name: str, texts: str) -> bool:
 
 
 def _of_scene(repo: HostRepo) -> Iterator[str]:
-    """Methods that the scene calls of the model whatever is asked for, and that the model lacks."""
+    """Methods that the scene calls of the model whatever is asked for, and that the model lacks, or
+    that do not take the values of these calls.
+    """
     tree, model = repo.tree("scene"), definition_of(repo, MODEL, "GaussianModel")[1]
     texts = text_of(tree) + text_of(repo.tree(MODEL))
     asked = [each for each in every(tree, ast.If) if "loaded_iter" not in text_of(each.test)]
     perhaps = {inner for each in (*asked, *every(tree, ast.Try)) for inner in nodes(each)}
     for node in (each for each in every(tree, ast.Call) if each not in perhaps):
         owner, _, name = text_of(node.func).rpartition(".")
-        if owner == "self.gaussians" and _lacks(model, name, texts):
-            at = repo.at("scene", node.lineno)
+        if owner != "self.gaussians":
+            continue
+        at, method = repo.at("scene", node.lineno), repo.function(MODEL, f"GaussianModel.{name}")
+        if _lacks(model, name, texts):
             yield f"its scene calls {name}, which GaussianModel lacks ({at})"
+        if why := misfit(method, node, of_model=True):
+            yield f"its scene's call of {name} {why}, which fails ({at})"
 
 
 def panoramas(repo: HostRepo) -> Iterator[str]:
@@ -344,7 +350,8 @@ def _own_options(repo: HostRepo, module: str) -> Iterator[str]:
         if not isinstance(node, ast.Assign):
             continue
         name = getattr(node.targets[0], "attr", "")
-        if name in _OURS and f".{name}" not in text_of(node.value):
+        value = text_of(node.value)
+        if name in _OURS and (f".{name}" not in value or ".get(" in value):
             yield f"sets {name} itself, whatever its command says ({at})"
         called = getattr(getattr(node.value, "func", None), "id", "")
         made = definition_of(repo, module, called)[1]
@@ -361,6 +368,33 @@ def _unmade(repo: HostRepo, module: str) -> Iterator[str]:
             if re.search(rf"\b{stem}\d", made) and f"{stem}{{" not in made:
                 folder = f"{name}, a folder that it makes for iterations of its own alone"
                 yield f"saves into {folder} ({repo.at(module, node.lineno)})"
+
+
+def _into_none(repo: HostRepo, module: str) -> Iterator[str]:
+    """Folders into which a script saves while it trains, and that nothing makes: its author's, or
+    one beside its model.
+    """
+    gone = _perhaps(repo, module)
+    made = re.findall(r"(?:makedirs|mkdir\w*)\(.*", "\n".join(texts_of(repo).values()))
+    for function in learning(repo.tree(module)):
+        values = {text_of(to): value for to, value in assigned(function)}
+        for node in (each for each in every(function, ast.Call) if each not in gone):
+            if not re.search(r"(^|\.)save(_image|z|txt)?$", text_of(node.func)):
+                continue
+            parts = [*node.args]
+            for each in parts:  # it grows
+                parts += [values.pop(n.id) for n in every(each, ast.Name) if n.id in values]
+            texts = [str(n.value) for each in parts for n in every(each, ast.Constant)]
+            found = [(each, "of its author's") for each in texts if _AUTHORS.match(each)]
+            if any("model_path" in text_of(each) for each in parts):
+                own = {name for each in texts for name in re.findall(r"^/(\w+)/", each)}
+                own = {name for name in own if not any(name in each for each in made)}
+                found += [(each, "that nothing makes") for each in sorted(own - {"point_cloud"})]
+            for folder, why in found:
+                yield f"saves into {folder}, a folder {why} ({repo.at(module, node.lineno)})"
+
+
+_AUTHORS = re.compile(r"/(home|Users|mnt|data)/\w")
 
 
 def _untyped(repo: HostRepo, module: str) -> Iterator[str]:

@@ -445,6 +445,14 @@ def test_values_that_a_drawing_function_is_given_may_be_those_of_a_ply(fork):
     assert read_plain(fork(given, (END, GSPLAT.format("both").replace("    drawn", joined))))
 
 
+def test_scales_times_a_factor_of_one_are_no_others(fork):
+    taken = ("override_color=None):", "override_color=None, scaling_modifier=1.0):")
+    scaled = "pc.get_scaling * scaling_modifier, pc"
+    assert read_plain(fork(taken, ("pc.get_scaling, pc", scaled)))
+    other = (taken[0], taken[1].replace("1.0", "2.0"))
+    assert "scales otherwise than" in str(read_plain(fork(other, ("pc.get_scaling, pc", scaled))))
+
+
 def test_positions_that_stand_still_are_no_others(fork):
     stands = "        self._xyz = nn.Parameter(points.requires_grad_(False))\n"
     trained = ("{'params': [], 'name': 'f_dc'}", "{'params': [self._opacity]}")
@@ -596,7 +604,9 @@ def test_a_model_in_a_folder_may_be_saved_by_a_script_above(fork, tmp_path):
     fork(("scene.save(", "scene.show("), root=tmp_path / "inner")
     assert judged(HostRepo(tmp_path)).reason == "inner/: none of its scripts saves a PLY"
     (tmp_path / "slam.py").write_text("scene.save(3)\n")
-    assert judged(HostRepo(tmp_path)).kind == "finetune"
+    verdict = judged(HostRepo(tmp_path))
+    assert verdict.kind == "finetune"
+    assert verdict.reason == "what its training compares with photographs was not found"
 
 
 @pytest.mark.parametrize("inner", ["", "inner"])
@@ -615,7 +625,12 @@ def test_run_is_named_where_it_would_train(fork, tmp_path, inner):
 )
 @pytest.mark.parametrize("inner", ["", "inner"])
 @pytest.mark.parametrize(
-    "change", [("    means3D = pc.get_xyz\n", MOVES), ("        shs = pc.get_features\n", COLOURS)]
+    "change",
+    [
+        ("    means3D = pc.get_xyz\n", MOVES),
+        ("    means3D = pc.get_xyz\n", MOVES.replace("+ dx", "+ pc.get_dx")),
+        ("        shs = pc.get_features\n", COLOURS),
+    ],
 )
 def test_an_argument_that_moves_or_colours_them_is_off_if_no_file_gives_it(
     fork, tmp_path, change, inner, given, kind
