@@ -26,11 +26,11 @@ from fragprune_graphdeco import (
     failing,
     is_off,
     mentioned,
+    plain,
     reading,
     syntax,
     text_of,
 )
-from fragprune_graphdeco.plain import SAVES
 from fragprune_plugins.adapting import HostRepo, nodes
 
 _CHECKPOINT = re.compile(
@@ -104,7 +104,7 @@ def _check_script(fork: Fork, script: str) -> None:
     if any(_blind(function, fork.drawing) for function in reading.learning(tree)):
         refuse("a loss which learns nothing of its picture", "a loss of the picture")
     reached = reading.reached(fork.repo, [reading.module_of(script)], "scene").values()
-    if not any(SAVES.search(text_of(each)) for each in reached):
+    if not any(plain.SAVES.search(text_of(each)) for each in reached):
         refuse("it saves no PLY", "a script that saves its model")
     if until := _rests(tree):
         refuse(f"its optimizer steps only where {until}", "to its end")

@@ -162,14 +162,16 @@ class Drawing:
         taken = function.args
         named = (*taken.posonlyargs, *taken.args, *taken.kwonlyargs)
         self.parameters = {each.arg for each in named}
-        self.off = off_by_default(function) - {*on}
+        read = every(function, ast.Attribute)
+        groups = {text_of(n.value) for n in read if reading.defaults(repo, "arguments", n.attr)}
+        self.off = off_by_default(function) - ({*on} - groups)  # a group's options are off, too
         given = [*zip(reversed(taken.args), reversed(taken.defaults), strict=False)]
         self.defaults = {a.arg: v for a, v in given}
         self.switches = {a.arg for a, v in given if isinstance(getattr(v, "value", None), bool)}
         self.values: dict[str, list[ast.expr]] = {}
         self.unasked = skipped(function, reading.as_options(repo, ("arguments",)))
-        read = (n for n in every(function, ast.Attribute) if n.attr.startswith("get_xyz"))
-        models = [each.value.id for each in read if isinstance(each.value, ast.Name)]
+        xyz = (each.value for each in read if each.attr.startswith("get_xyz"))
+        models = [each.id for each in xyz if isinstance(each, ast.Name)]
         self.model = models[0] if models else "pc"
         self.call = call or _call(function, self._known)
         self.arguments = arguments(self.call)

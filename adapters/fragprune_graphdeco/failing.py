@@ -20,6 +20,7 @@ from fragprune_graphdeco.reading import (
     module_of,
     options_of,
     own_imports,
+    reached,
     texts_of,
 )
 from fragprune_graphdeco.syntax import (
@@ -375,7 +376,8 @@ def _into_none(repo: HostRepo, module: str) -> Iterator[str]:
     one beside its model.
     """
     gone = _perhaps(repo, module)
-    made = re.findall(r"(?:makedirs|mkdir\w*)\(.*", "\n".join(texts_of(repo).values()))
+    whole = "\n".join(map(text_of, reached(repo, [module]).values()))
+    made = re.findall(r"(?:makedirs|mkdir\w*)\(.*", whole)
     for function in learning(repo.tree(module)):
         values = {text_of(to): value for to, value in assigned(function)}
         for node in (each for each in every(function, ast.Call) if each not in gone):

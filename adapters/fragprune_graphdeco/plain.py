@@ -280,7 +280,9 @@ def _moved(repo: HostRepo, callers: HostRepo) -> Iterator[tuple[str, bool]]:
         calls = [call for each in names for call in callers.calls(each, function.name)]
         takes = [each.arg for each in function.args.args]
         words = [pair for call in calls for pair in passed(call, takes).items()]
-        given = {name for name, value in words if not is_off(value)} & off_by_default(function)
+        off = {e for _, e in words if reading.off_in(repo, ("arguments",), getattr(e, "attr", ""))}
+        given = {name for name, value in words if not (is_off(value) or value in off)}
+        given &= off_by_default(function)
         usual = dict(Drawing(repo, module, function).inputs()) if given else {}
         for why, kept in Drawing(repo, module, function, on=given).inputs() if given else ():
             if why not in usual:

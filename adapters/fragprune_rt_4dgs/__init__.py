@@ -10,12 +10,10 @@ from __future__ import annotations
 
 import re
 from argparse import ArgumentParser
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fragprune_graphdeco import MODEL, GraphdecoAdapter, GraphdecoDialect, RasterizerCall, text_of
-from fragprune_graphdeco.kernels import normal_sources
+from fragprune_graphdeco import MODEL, GraphdecoAdapter, RasterizerCall, kernels, text_of
 from fragprune_plugins.adapting import (
     Finding,
     HostInfo,
@@ -106,7 +104,7 @@ class RT4DGS(GraphdecoAdapter):
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
         """Also that its Python turns 4D rotations as a vendored kernel does."""
-        found, texts = super().fingerprint(repo), normal_sources(repo, RASTERIZER)
+        found, texts = super().fingerprint(repo), kernels.normal_sources(repo, RASTERIZER)
         older = any(map(_OLDER.search, texts))
         if texts and older != turns_as_before(repo):
             at, says = (
@@ -116,9 +114,11 @@ class RT4DGS(GraphdecoAdapter):
             found.append(Finding.error("rotations", at, says, "the same"))
         return found
 
-    def dialect(self, repo: HostRepo) -> GraphdecoDialect:
+    def dialect(self, repo: HostRepo) -> RT4DGSDialect:
         """Also with the order of axes in 4D rotations."""
-        return replace(super().dialect(repo), older=turns_as_before(repo))
+        made = super().dialect(repo)
+        older = turns_as_before(repo)
+        return RT4DGSDialect(made.package, made.settings, made.outputs, older=older)
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
         """The same command, if the host can resume this configuration."""

@@ -112,6 +112,8 @@ COLOURS = """        shs = pc.get_features
             shs = shs + dx
 """
 MOVES = """    means3D = pc.get_xyz
+    if opt is not None and opt.random_background:
+        means3D = pc.get_xyz + pc.get_dx
     if dx is not None:
         means3D = pc.get_xyz + dx
 """
@@ -621,7 +623,14 @@ def test_run_is_named_where_it_would_train(fork, tmp_path, inner):
 
 
 @pytest.mark.parametrize(
-    ("given", "kind"), [("dx=None", "finetune"), ("dx=dx", "never"), ("False, None, dx", "never")]
+    ("given", "kind"),
+    [
+        ("dx=None", "finetune"),
+        ("dx=opt.random_background", "finetune"),
+        ("opt=opt", "finetune"),
+        ("dx=dx", "never"),
+        ("False, None, dx", "never"),
+    ],
 )
 @pytest.mark.parametrize("inner", ["", "inner"])
 @pytest.mark.parametrize(
@@ -635,7 +644,11 @@ def test_run_is_named_where_it_would_train(fork, tmp_path, inner):
 def test_an_argument_that_moves_or_colours_them_is_off_if_no_file_gives_it(
     fork, tmp_path, change, inner, given, kind
 ):
-    fork(("override_color=None):", "override_color=None, dx=None):"), change, root=tmp_path / inner)
+    fork(
+        ("override_color=None):", "override_color=None, dx=None, opt=None):"),
+        change,
+        root=tmp_path / inner,
+    )
     (tmp_path / "slam.py").write_text(f"package = render(camera, model, pipe, bg, {given})\n")
     assert judged(HostRepo(tmp_path)).kind == kind
 
