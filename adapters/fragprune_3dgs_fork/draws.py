@@ -74,10 +74,10 @@ def read_draws(fork: Fork) -> None:
         given = {key for key, value in _given(fork, body) if not isinstance(value, ast.Attribute)}
         for node in every(body, ast.Call) if name in called else ():
             if "means3D" in arguments(node):
-                other = Drawing(repo, RENDERER, body, call=node, on=given)
+                other = Drawing(repo, RENDERER, body, call=node)
                 for found in (why for why, moves in other.shapes() if not moves):
                     refuse(found, "the model's own Gaussians")
-                if selected := other.selection():
+                if selected := Drawing(repo, RENDERER, body, call=node, on=given).selection():
                     refuse(f"draws a selection, {selected}", "all rows")
         for cut in [*source.cuts()][:1]:
             refuse(f"a picture of more channels, {text_of(cut)}", "a picture")

@@ -276,14 +276,17 @@ def _moved(repo: HostRepo, callers: HostRepo) -> Iterator[tuple[str, bool]]:
     texts = reading.texts_of(callers).items()
     for module, function in ((m, f) for m in _renderers(repo)[:1] for f in drawing_in(repo, m)[:1]):
         paths = [path for path, text in texts if f"{function.name}(" in text]
-        names = (reading.module_of(each.relative_to(callers.root).as_posix()) for each in paths)
+        names = [reading.module_of(each.relative_to(callers.root).as_posix()) for each in paths]
         calls = [call for each in names for call in callers.calls(each, function.name)]
         takes = [each.arg for each in function.args.args]
         words = [pair for call in calls for pair in passed(call, takes).items()]
-        off = {e for _, e in words if reading.off_in(repo, ("arguments",), getattr(e, "attr", ""))}
+        asked = {value: getattr(value, "attr", "") for _, value in words}
+        of = [(repo, ("arguments",)), (callers, names)]
+        off = {e for e, name in asked.items() if any(reading.off_in(*at, name) for at in of)}
         given = {name for name, value in words if not (is_off(value) or value in off)}
         given &= off_by_default(function)
         usual = dict(Drawing(repo, module, function).inputs()) if given else {}
+        made = rf"from ([\w.]+, )*({'|'.join(sorted(given))})(,| \()|(?<!colours) from \w+\.get_"
         for why, kept in Drawing(repo, module, function, on=given).inputs() if given else ():
-            if why not in usual:
+            if why not in usual and re.search(made, why):
                 yield why, kept
