@@ -46,6 +46,8 @@ _ADDED = re.compile(r"([{;])atomicAdd\(&\(?(\w+)\[collected_id\[j\]\]\)?,(alpha\
 """A sum for each Gaussian over its fragments, in a statement of its own."""
 _BLOCK = r"\{(?:[^{}]|" * 4 + r"\{[^{}]*\}" + r")*\}" * 4
 """Code between braces, with further ones inside."""
+_OPACITY = re.compile(r"alpha|acc(?!.*count)|opac")
+"""In the name of the sum of a ray's weights."""
 _DRAWN = re.compile(r"if\(test_T<0\.0001\)\{done=true;continue;\}")
 """Behind it, a fragment is one that is drawn."""
 
@@ -90,7 +92,9 @@ def meaning(repo: HostRepo, call: graphdeco.CallInSource, name: str) -> Output:
         for each, sums in known.items():
             if _written(text, name, "depth", sums):
                 return Output(name, each, detached=flat)  # type: ignore[arg-type]
-    elif re.search(r"alpha|acc|opac", name) and _written(text, name, "alpha|opac", weights):
+    elif re.search(r"alpha|acc(?!.*count)|opac", name) and _written(
+        text, name, "alpha|opac", weights
+    ):
         return Output(name, "alpha", detached=flat)
     elif blended and moved is not None:
         images = set(re.findall(r"\bout_(\w+)\[[^]]*\]=", text))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from functools import partial
 
 import fragprune_graphdeco as graphdeco
@@ -20,7 +20,17 @@ from fragprune_3dgs_fork.fork import (
     methods_of,
     under,
 )
-from fragprune_graphdeco import every, failing, is_off, mentioned, reading, syntax, text_of
+from fragprune_graphdeco import (
+    assigned,
+    every,
+    failing,
+    is_off,
+    mentioned,
+    plain,
+    reading,
+    syntax,
+    text_of,
+)
 from fragprune_plugins.adapting import HostRepo, nodes
 
 _CHECKPOINT = re.compile(
@@ -87,6 +97,15 @@ def _check_script(fork: Fork, script: str) -> None:
         fork.warn("script", script, f"the size of its pictures in stage 2, {size}")
     if several := _trainings(fork, reading.module_of(script)):
         refuse(*several)
+    ways = [node for node, name in method_calls(tree) if name == "backward"]
+    if ways and all(each in fork.optional for each in ways):
+        only = sorted(frozenset().union(*(fork.optional[each] for each in ways)))
+        refuse(f"it trains only with --{', --'.join(only)}", "a training by default")
+    if any(_blind(function, fork.drawing) for function in reading.learning(tree)):
+        refuse("a loss which learns nothing of its picture", "a loss of the picture")
+    reached = reading.reached(fork.repo, [reading.module_of(script)], "scene").values()
+    if not any(plain.SAVES.search(text_of(each)) for each in reached):
+        refuse("it saves no PLY", "a script that saves its model")
     if until := _rests(tree):
         refuse(f"its optimizer steps only where {until}", "to its end")
     loops = [
@@ -97,6 +116,9 @@ def _check_script(fork: Fork, script: str) -> None:
     counted = [each for each in loops if "iterations" in text_of(each.iter)]
     if any(each in nodes(outer)[1:] for each in counted for outer in loops):
         refuse("a training in a loop", "one training")
+    within = {each for loop in counted for each in nodes(loop)[1:]}
+    if not within.isdisjoint(loops) and "several models" not in fork.one_run:
+        refuse("goes backward several times in an iteration", "once, by which steps are counted")
     fork.one_run = fork.one_run or next(_not_resumed(fork.repo, script, tree), "")
 
 
@@ -127,6 +149,30 @@ def _rests(tree: ast.Module) -> str:
     called = [n for n, name in method_calls(tree) if name == "step"]
     steps = [n for n in called if text_of(n.func).removesuffix(".optimizer.step") in models]
     return parts[steps[0]] if steps and parts.keys() >= {*steps} else ""
+
+
+def _blind(function: ast.FunctionDef, drawing: Collection[str]) -> bool:
+    """Whether the loss that a function goes backward by is made of what it drew without the picture
+    itself, as of objects alone.
+    """
+    made: dict[str, list[ast.expr]] = {}
+    for more in every(function, ast.AugAssign):
+        made.setdefault(text_of(more.target), []).append(more.value)
+    for to, value in assigned(function):
+        for each in getattr(to, "elts", [to]):
+            made.setdefault(text_of(each), []).append(value)
+    waiting: list[ast.AST] = [n.func for n, name in method_calls(function) if name == "backward"]
+    blind = False
+    for node in waiting:  # it grows
+        key = getattr(getattr(node, "slice", None), "value", None)
+        if key == "render" or getattr(getattr(node, "func", None), "id", "") in drawing:
+            return False
+        drawn = made.get(text_of(node.value), []) if isinstance(node, ast.Subscript) else []
+        if isinstance(key, str) and any(isinstance(each, ast.Call) for each in drawn):
+            blind = True
+        else:
+            waiting += [*made.pop(text_of(node), []), *ast.iter_child_nodes(node)]
+    return blind
 
 
 def _trainings(fork: Fork, module: str) -> tuple[str, str] | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 
 from fragprune_graphdeco import reading
 from fragprune_graphdeco.call import ARGUMENTS, read_calls
@@ -86,14 +86,6 @@ def drawing_in(repo: HostRepo, module: str) -> list[ast.FunctionDef]:
     return sorted(found, key=lambda each: (each.name != "render", not pictures(each)))
 
 
-def given_to(function: Function, trees: Iterable[ast.AST]) -> dict[str, ast.expr]:
-    """What code gives a drawing function by its parameters, without what is off."""
-    takes = [each.arg for each in function.args.args]
-    calls = (each for tree in trees for each in every(tree, ast.Call))
-    named = (passed(each, takes) for each in calls if text_of(each.func) == function.name)
-    return {key: value for each in named for key, value in each.items() if not is_off(value)}
-
-
 def _call(function: ast.AST, known: Known = lambda _: []) -> ast.Call | None:
     """The call that draws, of several one whose picture is returned, and that is made by the values
     that are known.
@@ -170,14 +162,16 @@ class Drawing:
         taken = function.args
         named = (*taken.posonlyargs, *taken.args, *taken.kwonlyargs)
         self.parameters = {each.arg for each in named}
-        self.off = off_by_default(function) - {*on}
+        read = every(function, ast.Attribute)
+        groups = {text_of(n.value) for n in read if reading.defaults(repo, "arguments", n.attr)}
+        self.off = off_by_default(function) - ({*on} - groups)  # a group's options are off, too
         given = [*zip(reversed(taken.args), reversed(taken.defaults), strict=False)]
         self.defaults = {a.arg: v for a, v in given}
         self.switches = {a.arg for a, v in given if isinstance(getattr(v, "value", None), bool)}
         self.values: dict[str, list[ast.expr]] = {}
         self.unasked = skipped(function, reading.as_options(repo, ("arguments",)))
-        read = (n for n in every(function, ast.Attribute) if n.attr.startswith("get_xyz"))
-        models = [each.value.id for each in read if isinstance(each.value, ast.Name)]
+        xyz = (each.value for each in read if each.attr.startswith("get_xyz"))
+        models = [each.id for each in xyz if isinstance(each, ast.Name)]
         self.model = models[0] if models else "pc"
         self.call = call or _call(function, self._known)
         self.arguments = arguments(self.call)
@@ -255,9 +249,10 @@ class Drawing:
         """What an expression is made of: "model.x", parameters, and "model" itself."""
         if node is None:
             return
-        if re.match(r"getattr\(\w+, '", text_of(node)):  # the attribute, and what it is without
+        called = text_of(getattr(node, "func", None)) == "getattr"
+        if called and re.match(r"getattr\(\w+, '", text_of(node)):
             of, name, *others = node.args  # type: ignore[attr-defined]
-            yield from (root for each in others for root in self._roots(each))
+            yield from (root for each in others for root in self._roots(each))  # without it
             node = ast.Attribute(of, name.value)
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
             if self.made.get(node.value.id) == (self.model,):
@@ -393,11 +388,9 @@ class Drawing:
         if isinstance(value, ast.Compare | ast.UnaryOp):
             return whole
         if isinstance(value, ast.BinOp):
-            by = text_of(value.right)
-            keeps = isinstance(value.op, ast.Add) and bool(_ADDED.search(by))
-            if own and isinstance(value.op, ast.Mult) and by.startswith("scal"):
-                keeps = getattr(self.defaults.get(by), "value", 0) == 1  # if it is not given
-            return self._made_into(value.left, seen, own) if keeps else whole
+            factor = getattr(self.defaults.get(text_of(value.right)), "value", None)
+            same = {ast.Add: _ADDED.search(text_of(value.right)), ast.Mult: factor == 1}
+            return self._made_into(value.left, seen, own) if same.get(type(value.op)) else whole
         if seen and isinstance(value, ast.Constant) and value.value is not None:
             return whole
         if own and text_of(value) in (f"{of_model}_scaling", f"{of_model}_opacity"):

@@ -22,6 +22,7 @@ from fragprune_graphdeco.reading import (
     module_of,
     options_of,
     own_imports,
+    reached,
     texts_of,
 )
 from fragprune_graphdeco.syntax import (
@@ -71,7 +72,7 @@ def reasons(repo: HostRepo, scripts: tuple[str, ...]) -> tuple[str, ...]:
         found += (*_misfits(repo, module), *_absent(repo, module), *_own_options(repo, module))[:1]
         found += [*_of_cameras(repo, module)][:1]
         found += [*_untyped(repo, module)][:1]
-        found += [*_unmade(repo, module)][:1]
+        found += [*_unmade(repo, module), *_into_none(repo, module)][:1]
         found += [f"{script} {why}" for why, asked in _ends(repo, module) if not asked][:1]
         found += [f"{script} draws by {each}" for each in _drawn_elsewhere(repo, module)][:1]
     return tuple(found)
@@ -222,16 +223,22 @@ def _lacks(model: ast.AST | None, name: str, texts: str) -> bool:
 
 
 def _of_scene(repo: HostRepo) -> Iterator[str]:
-    """Methods that the scene calls of the model whatever is asked for, and that the model lacks."""
+    """Methods that the scene calls of the model whatever is asked for, and that the model lacks, or
+    that do not take the values of these calls.
+    """
     tree, model = repo.tree("scene"), definition_of(repo, MODEL, "GaussianModel")[1]
     texts = text_of(tree) + text_of(repo.tree(MODEL))
     asked = [each for each in every(tree, ast.If) if "loaded_iter" not in text_of(each.test)]
     perhaps = {inner for each in (*asked, *every(tree, ast.Try)) for inner in nodes(each)}
     for node in (each for each in every(tree, ast.Call) if each not in perhaps):
         owner, _, name = text_of(node.func).rpartition(".")
-        if owner == "self.gaussians" and _lacks(model, name, texts):
-            at = repo.at("scene", node.lineno)
+        if owner != "self.gaussians":
+            continue
+        at, method = repo.at("scene", node.lineno), repo.function(MODEL, f"GaussianModel.{name}")
+        if _lacks(model, name, texts):
             yield f"its scene calls {name}, which GaussianModel lacks ({at})"
+        if why := misfit(method, node, of_model=True):
+            yield f"its scene's call of {name} {why}, which fails ({at})"
 
 
 def panoramas(repo: HostRepo) -> Iterator[str]:
@@ -361,7 +368,8 @@ def _overruled(node: ast.AST) -> str:
     """The option of ours that a statement sets to what is not made of it; "" if it sets none."""
     to = node.targets[0] if isinstance(node, ast.Assign) else None
     name = to.attr if isinstance(to, ast.Attribute) and text_of(to.value) != "self" else ""
-    return name if name in _OURS and f".{name}" not in text_of(node.value) else ""  # type: ignore[attr-defined]
+    value = text_of(node.value) if name in _OURS else f".{name}"  # type: ignore[attr-defined]
+    return name if f".{name}" not in value or ".get(" in value else ""
 
 
 def _unmade(repo: HostRepo, module: str) -> Iterator[str]:
@@ -373,6 +381,34 @@ def _unmade(repo: HostRepo, module: str) -> Iterator[str]:
             if re.search(rf"\b{stem}\d", made) and f"{stem}{{" not in made:
                 folder = f"{name}, a folder that it makes for iterations of its own alone"
                 yield f"saves into {folder} ({repo.at(module, node.lineno)})"
+
+
+def _into_none(repo: HostRepo, module: str) -> Iterator[str]:
+    """Folders into which a script saves while it trains, and that nothing makes: its author's, or
+    one beside its model.
+    """
+    gone = _perhaps(repo, module)
+    whole = "\n".join(map(text_of, reached(repo, [module]).values()))
+    made = re.findall(r"(?:makedirs|mkdir\w*)\(.*", whole)
+    for function in learning(repo.tree(module)):
+        values = {text_of(to): value for to, value in assigned(function)}
+        for node in (each for each in every(function, ast.Call) if each not in gone):
+            if not re.search(r"(^|\.)save(_image|z|txt)?$", text_of(node.func)):
+                continue
+            parts = [*node.args]
+            for each in parts:  # it grows
+                parts += [values.pop(n.id) for n in every(each, ast.Name) if n.id in values]
+            texts = [str(n.value) for each in parts for n in every(each, ast.Constant)]
+            found = [(each, "of its author's") for each in texts if _AUTHORS.match(each)]
+            if any("model_path" in text_of(each) for each in parts):
+                own = {name for each in texts for name in re.findall(r"^/(\w+)/", each)}
+                own = {name for name in own if not any(name in each for each in made)}
+                found += [(each, "that nothing makes") for each in sorted(own - {"point_cloud"})]
+            for folder, why in found:
+                yield f"saves into {folder}, a folder {why} ({repo.at(module, node.lineno)})"
+
+
+_AUTHORS = re.compile(r"/(home|Users|mnt|data)/\w")
 
 
 def _untyped(repo: HostRepo, module: str) -> Iterator[str]:

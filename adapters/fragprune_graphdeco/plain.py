@@ -22,7 +22,7 @@ from fragprune_graphdeco.syntax import assigned, every, is_off, off_by_default, 
 from fragprune_plugins.adapting import HostRepo, Plain, change_of, nodes
 
 _DEEPEST = 3  # folders below a checkout in which codebases are looked for
-_SAVES = re.compile(r"\.save_ply\w*\(|scene\w*\.save\(")
+SAVES = re.compile(r"\.save_ply\w*\(|scene\w*\.save\(")
 _ABSENT = "no model of this family that saves a PLY was found"
 _UNSAVED = "none of its scripts saves a PLY"
 
@@ -32,15 +32,15 @@ def read_models(repo: HostRepo) -> list[Plain]:
     patterns = ("*/" * deep + "gaussian_renderer" for deep in range(1, _DEEPEST + 1))
     found = (path.parent for each in patterns for path in repo.root.glob(each) if path.is_dir())
     names = (each.relative_to(repo.root).as_posix() for each in sorted(found))
-    saves = any(map(_SAVES.search, reading.texts_of(repo).values()))  # also what is in a folder
+    saves = any(map(SAVES.search, reading.texts_of(repo).values()))  # also what is in a folder
     own, models = read_plain(repo), []
     for each in (name for name in names if "/." not in f"/{name}"):
         model = read_plain(HostRepo(repo.root / each))
         reasons = [why for why in model.reasons if not saves or why != _UNSAVED]
         reasons += dict(_moved(HostRepo(repo.root / each), repo))
-        above = not reasons and _UNSAVED in model.reasons  # what trains it lies above
-        differs = unlike(repo, reading.training_modules(repo)) if above else model.unlike
-        models.append(replace(model, folder=each, reasons=tuple(reasons), unlike=differs))
+        if reasons != [*model.reasons] and not reasons:  # what trains it lies above its folder
+            model = replace(model, unlike=unlike(repo, reading.training_modules(repo)))
+        models.append(replace(model, folder=each, reasons=tuple(reasons)))
     beside = not _own_renderers(repo) and any(each.model for each in models)
     if beside:  # what was found by itself is that of a folder
         own = Plain(own.reasons or (_ABSENT,))
@@ -175,7 +175,7 @@ def _of_scripts(model: ModelClass) -> Iterator[str]:
     if not any(drawing_in(repo, module) for module in _renderers(repo)):
         found = "no function was found that calls a rasterizer of 3DGS"
         yield f"what draws its PLY was not read: {found}"
-    if any(repo.root.glob("*.py")) and not any(map(_SAVES.search, reading.texts_of(repo).values())):
+    if any(repo.root.glob("*.py")) and not any(map(SAVES.search, reading.texts_of(repo).values())):
         yield _UNSAVED
     for script in scripts:
         yield from _of_sums(repo, script)
@@ -276,11 +276,17 @@ def _moved(repo: HostRepo, callers: HostRepo) -> Iterator[tuple[str, bool]]:
     texts = reading.texts_of(callers).items()
     for module, function in ((m, f) for m in _renderers(repo)[:1] for f in drawing_in(repo, m)[:1]):
         paths = [path for path, text in texts if f"{function.name}(" in text]
-        names = (reading.module_of(each.relative_to(callers.root).as_posix()) for each in paths)
+        names = [reading.module_of(each.relative_to(callers.root).as_posix()) for each in paths]
         calls = [call for each in names for call in callers.calls(each, function.name)]
         takes = [each.arg for each in function.args.args]
         words = [pair for call in calls for pair in passed(call, takes).items()]
-        given = {name for name, value in words if not is_off(value)} & off_by_default(function)
+        asked = {value: getattr(value, "attr", "") for _, value in words}
+        of = [(repo, ("arguments",)), (callers, names)]
+        off = {e for e, name in asked.items() if any(reading.off_in(*at, name) for at in of)}
+        given = {name for name, value in words if not (is_off(value) or value in off)}
+        given &= off_by_default(function)
+        usual = dict(Drawing(repo, module, function).inputs()) if given else {}
+        made = rf"from ([\w.]+, )*({'|'.join(sorted(given))})(,| \()|(?<!colours) from \w+\.get_"
         for why, kept in Drawing(repo, module, function, on=given).inputs() if given else ():
-            if re.search(rf"from ([\w.]+, )*({'|'.join(sorted(given))})(,| \()", why):
+            if why not in usual and re.search(made, why):
                 yield why, kept

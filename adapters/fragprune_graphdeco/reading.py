@@ -346,13 +346,14 @@ def off_in(repo: HostRepo, modules: Iterable[str], name: str) -> bool:
 
 @lru_cache(maxsize=256)
 def _defaults(tree: ast.Module | None) -> dict[str, list[ast.expr]]:
-    """``defaults`` of all names."""
+    """``defaults`` of all names, without what is counted on."""
     found: dict[str, list[ast.expr]] = {}
+    counted = {text_of(each.target) for each in every(tree, ast.AugAssign)}
     for node in nodes(tree):
         if isinstance(node, ast.FunctionDef) and node.name == "__init__":
             for made in (each for each in nodes(node) if isinstance(each, ast.Assign)):
                 owner, _, name = text_of(made.targets[0]).partition(".")
-                if owner == "self":
+                if owner == "self" and f"self.{name}" not in counted:
                     found.setdefault(name, []).append(made.value)
         elif isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "add_argument":
             given = {each.arg: each.value for each in node.keywords}

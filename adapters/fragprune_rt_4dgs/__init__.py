@@ -13,7 +13,7 @@ from argparse import ArgumentParser
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fragprune_graphdeco import MODEL, GraphdecoAdapter, RasterizerCall, text_of
+from fragprune_graphdeco import MODEL, GraphdecoAdapter, RasterizerCall, kernels, text_of
 from fragprune_plugins.adapting import (
     Finding,
     HostInfo,
@@ -30,6 +30,16 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 ROTATIONS = "utils.general_utils"  # where the host makes 4D rotations
+
+
+_OLDER = re.compile(r"a,-b,-c,-d,b,a,-d,c,c,d,a,-b,d,-c,b,a")
+"""A kernel's left quaternion as a matrix, before late 2024."""
+
+
+def turns_as_before(repo: HostRepo) -> bool:
+    """Whether 4D rotations do not have their axes turned round, as they do since late 2024."""
+    texts = [text_of(repo.tree(each)) for each in (MODEL, ROTATIONS)]
+    return not any(map(re.compile(r"\bflip\([^()]*1, 2").search, texts))
 
 
 def with_its_map(call: SeamCall) -> Any:
@@ -93,14 +103,22 @@ class RT4DGS(GraphdecoAdapter):
     )
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
-        """Also that 4D rotations have their axes turned round, as the host does since late 2024."""
-        texts = [text_of(repo.tree(each)) for each in (MODEL, ROTATIONS)]
-        found = super().fingerprint(repo)
-        if not any(map(re.compile(r"\bflip\([^()]*1, 2").search, texts)):
-            older = "4D rotations whose axes are not turned round"  # another picture of them
-            at = repo.place(ROTATIONS, "build_rotation_4d")
-            found.append(Finding.error("rotations", at, older, "flip(1, 2) of them"))
+        """Also that its Python turns 4D rotations as a vendored kernel does."""
+        found, texts = super().fingerprint(repo), kernels.normal_sources(repo, RASTERIZER)
+        older = any(map(_OLDER.search, texts))
+        if texts and older != turns_as_before(repo):
+            at, says = (
+                repo.place(ROTATIONS, "build_rotation_4d"),
+                "other 4D rotations than its kernel",
+            )
+            found.append(Finding.error("rotations", at, says, "the same"))
         return found
+
+    def dialect(self, repo: HostRepo) -> RT4DGSDialect:
+        """Also with the order of axes in 4D rotations."""
+        made = super().dialect(repo)
+        older = turns_as_before(repo)
+        return RT4DGSDialect(made.package, made.settings, made.outputs, older=older)
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
         """The same command, if the host can resume this configuration."""

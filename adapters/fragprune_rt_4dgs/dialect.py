@@ -27,11 +27,18 @@ ARGUMENTS = frozenset(("flow_2d", "ts", "scales_t", "rotations_r", "prefilter_va
 
 OUTPUTS = 6
 
+OLDER = (1.0, -1.0, 1.0, -1.0), (1.0, 1.0, -1.0, -1.0)
+"""Signs of the left and the right quaternions that turn as those of 2024 did, with axes t, z, y, x:
+a matrix of these that is read from its end is that of the same numbers with these signs.
+"""
+
 
 @dataclass(frozen=True)
 class RT4DGSDialect(GraphdecoDialect):
     """Cuts the 4D Gaussians at the call's moment; an engine draws the 3D Gaussians."""
 
+    older: bool = False
+    """4D rotations have their axes in another order, as the host's had until late 2024."""
     own_kernels = "compiler"
     returned = ("image", "radii", "depth", "alpha", "flow")
 
@@ -50,7 +57,7 @@ class RT4DGSDialect(GraphdecoDialect):
         The host also drops a Gaussian whose integer radius is not above 0.4. With a dilation of 0.3
         pixels^2 no radius is below 3, so this drops only covariances that are not finite.
         """
-        sliced = at_moment(call)
+        sliced = at_moment(call, self.older)
         flat = {
             "means3D": sliced.means,
             "means2D": call.get("means2D"),
@@ -110,7 +117,7 @@ class RT4DGSDialect(GraphdecoDialect):
         return {**super().modules(draw), "pointops2_cuda": neighbours}
 
 
-def at_moment(call: HostCall) -> Sliced:
+def at_moment(call: HostCall, older: bool = False) -> Sliced:
     """The Gaussians of a call as 3D Gaussians, by the host's code path for this call."""
     from fragprune_plugins.slicing.cutting import slice_at
 
@@ -124,6 +131,9 @@ def at_moment(call: HostCall) -> Sliced:
             given["scales_t"] = call["scales_t"].reshape(-1)
         if s.rot_4d:
             given["rotations_r"] = call["rotations_r"]
+        if s.rot_4d and older:
+            for name, signs in zip(("rotations", "rotations_r"), OLDER, strict=True):
+                given[name] = given[name] * given[name].new_tensor(signs)
     if in_time:
         given["times"] = call["ts"].reshape(-1)
     splats = SpacetimeSplats(

@@ -7,11 +7,12 @@ import pytest
 import torch
 from cli.commands import succeeds
 from miniatures.rt_4dgs import PythonHost, RigidHost, RT4DGSHost
-from miniatures.runs import miniature
+from miniatures.runs import edit, miniature, written
 from scenes import blended
 
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.errors import AlignmentError, HostNeedsError, UsageError
+from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection.launch import RunOptions, run
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.plugins.hookspecs import hookimpl
@@ -128,9 +129,13 @@ def test_every_parameter_gets_a_gradient_even_if_nobody_is_there(mini, driver):
         assert not package["viewspace_points"].grad.any()
 
 
-def test_slicing_in_python_draws_the_same_with_the_same_thresholds(mini):
+@pytest.mark.parametrize("state", ["today", "2024"])
+def test_slicing_in_python_draws_the_same_with_the_same_thresholds(mini, tmp_path, state):
     """Two ways of the host to one picture: rows picked by us, or by nobody."""
     pictures = []
+    if state == "2024":  # its 4D rotations had their axes in another order
+        mini = written(RT4DGSHost, tmp_path)
+        edit(mini / "scene/gaussian_model.py", ".flip(1, 2)", "")
     for driver in (RT4DGSHost(), PythonHost()):
         notes = FixedThresholds(torch.linspace(0.02, 0.6, COUNT))
         with joint(plugins=[notes], **of(mini, driver)) as host:
@@ -141,6 +146,20 @@ def test_slicing_in_python_draws_the_same_with_the_same_thresholds(mini):
                 pictures.append(host.render(host.camera(), model)["render"])
     assert len(notes.inputs.splats) < COUNT
     torch.testing.assert_close(*pictures, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("kernel", ["a, -b, -c, -d, b, a, -d, c, c, d, a, -b, d, -c, b, a", "a"])
+@pytest.mark.parametrize("state", ["today", "2024"])
+def test_a_kernel_that_turns_otherwise_than_its_python_is_refused(tmp_path, state, kernel):
+    root = written(RT4DGSHost, tmp_path)
+    if state == "2024":
+        edit(root / "scene/gaussian_model.py", ".flip(1, 2)", "")
+    package = root / "submodules/a/diff_gaussian_rasterization"
+    package.mkdir(parents=True)
+    (package / "__init__.py").touch()
+    (package.parent / "forward.cu").write_text(f"glm::mat4({kernel});")
+    codes = {each.code for each in RT4DGS().match(HostRepo(root)).findings}
+    assert ("rotations" in codes) == ((kernel == "a") == (state == "2024"))
 
 
 def test_rows_that_are_not_those_of_the_moment_are_refused_with_both_counts(mini, monkeypatch):

@@ -35,7 +35,6 @@ MODEL = "scene/gaussian_model.py"
             "os.rename(self.gaussians.save_ply('.tmp'), self._ply(iteration))",
             "Scene.save renames the PLY that it saves",
         ),
-        ("rt-4dgs", MODEL, ".flip(1, 2)", "", "axes are not turned round"),
     ],
 )
 def test_a_changed_host_is_refused_by_what_changed(adapter, file, old, new, found, tmp_path):

@@ -141,14 +141,14 @@ KNOWN = {
         *OF_ADAPTERS,
         *("fragprune_3dgs_fork", "fragprune_3dgs_fork.methods", "fragprune_3dgs_fork.read"),
     },
-    **dict.fromkeys(
-        (
+    **{
+        name: {*OF_ADAPTERS, "fragprune_3dgs_fork.holding"}
+        for name in (
             *("fragprune_2dgs", "fragprune_4dgaussians", "fragprune_light_gaussian"),
             *("fragprune_mcmc", "fragprune_mini_splatting", "fragprune_mip_splatting"),
             *("fragprune_rain_gs", "fragprune_speedy_splat"),
-        ),
-        {*OF_ADAPTERS, "fragprune_3dgs_fork.holding"},
-    ),
+        )
+    },
     # its host moves in time
     "fragprune_rt_4dgs": {
         *OF_ADAPTERS,

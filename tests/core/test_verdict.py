@@ -113,6 +113,8 @@ COLOURS = """        shs = pc.get_features
             shs = shs + dx
 """
 MOVES = """    means3D = pc.get_xyz
+    if opt is not None and opt.random_background:
+        means3D = pc.get_xyz + pc.get_dx
     if dx is not None:
         means3D = pc.get_xyz + dx
 """
@@ -453,6 +455,14 @@ def test_values_that_a_drawing_function_is_given_may_be_those_of_a_ply(fork):
     assert read_plain(fork(given, (END, GSPLAT.format("both").replace("    drawn", joined))))
 
 
+def test_scales_times_a_factor_of_one_are_no_others(fork):
+    taken = ("override_color=None):", "override_color=None, scaling_modifier=1.0):")
+    scaled = "pc.get_scaling * scaling_modifier, pc"
+    assert read_plain(fork(taken, ("pc.get_scaling, pc", scaled)))
+    other = (taken[0], taken[1].replace("1.0", "2.0"))
+    assert "scales otherwise than" in str(read_plain(fork(other, ("pc.get_scaling, pc", scaled))))
+
+
 def test_positions_that_stand_still_are_no_others(fork):
     stands = "        self._xyz = nn.Parameter(points.requires_grad_(False))\n"
     trained = ("{'params': [], 'name': 'f_dc'}", "{'params': [self._opacity]}")
@@ -620,16 +630,32 @@ def test_run_is_named_where_it_would_train(fork, tmp_path, inner):
 
 
 @pytest.mark.parametrize(
-    ("given", "kind"), [("dx=None", "finetune"), ("dx=dx", "never"), ("False, None, dx", "never")]
+    ("given", "kind"),
+    [
+        ("dx=None", "finetune"),
+        ("dx=opt.random_background", "finetune"),
+        ("opt=opt", "finetune"),
+        ("dx=dx", "never"),
+        ("False, None, dx", "never"),
+    ],
 )
 @pytest.mark.parametrize("inner", ["", "inner"])
 @pytest.mark.parametrize(
-    "change", [("    means3D = pc.get_xyz\n", MOVES), ("        shs = pc.get_features\n", COLOURS)]
+    "change",
+    [
+        ("    means3D = pc.get_xyz\n", MOVES),
+        ("    means3D = pc.get_xyz\n", MOVES.replace("+ dx", "+ pc.get_dx")),
+        ("        shs = pc.get_features\n", COLOURS),
+    ],
 )
 def test_an_argument_that_moves_or_colours_them_is_off_if_no_file_gives_it(
     fork, tmp_path, change, inner, given, kind
 ):
-    fork(("override_color=None):", "override_color=None, dx=None):"), change, root=tmp_path / inner)
+    fork(
+        ("override_color=None):", "override_color=None, dx=None, opt=None):"),
+        change,
+        root=tmp_path / inner,
+    )
     (tmp_path / "slam.py").write_text(f"package = render(camera, model, pipe, bg, {given})\n")
     assert judged(HostRepo(tmp_path)).kind == kind
 

@@ -251,33 +251,29 @@ inline int blend_block(const Batch& batch, const int32_t* which, int count, int 
                        Lanes px, Lanes py, float alpha_max, float line, const BlockPixels& before,
                        BlockPixels& pixels, Also also) {
   const Lanes floor = broadcast<Lanes>(kStop ? line : kTransmittanceMin);
+  const Lanes faintest = broadcast<Lanes>(kFaintest), none = broadcast<Lanes>(0.f);
   Lanes light = before.light;
   Lanes r = before.r, g = before.g, blue = before.b, inv_z = before.inv_z;
   IntLanes drawn_count = before.drawn, stop = before.stop;
   Mask alive = before.alive;
   const auto blend = [&](const int32_t* who, auto some) {
     constexpr int kSome = decltype(some)::value;
-    Lanes alpha[kSome];
-    Mask inside[kSome], partly[kSome];
-    Nearness<Lanes> near[kSome];
+    Lanes alpha[kSome], share[kSome];
+    Mask inside[kSome];
     for (int k = 0; k < kSome; k++) {
       const int j = who[k];
       const Meeting<Lanes> m = meet(batch[j], px, py);
       alpha[k] = m.exponent;
-      if constexpr (kSoft) {
-        near[k] = nearness_of(batch[j], m);
-        const Mask visible = ge(m.exponent, broadcast<Lanes>(kFaintest));
-        partly[k] = both(visible, gt(near[k].square, near[k].inwards * near[k].inwards));
-        inside[k] = either(partly[k], both(visible, gt(near[k].inwards, broadcast<Lanes>(0.f))));
+      if constexpr (kSoft) {  // no branch: rims cross most blocks, and it would often be guessed wrong
+        share[k] = coverage_of(batch[j], m).share;
+        inside[k] = both(ge(m.exponent, faintest), gt(share[k], none));
       } else {
         inside[k] = ge(m.exponent, broadcast<Lanes>(batch.cut[j]));
       }
     }
     for (int k = 0; k < kSome; k++) {
       alpha[k] = capped(exp2(alpha[k]), alpha_max);
-      if constexpr (kSoft)
-        if (bits(partly[k]))
-          alpha[k] = select(partly[k], alpha[k] * coverage_of(near[k]).share, alpha[k]);
+      if constexpr (kSoft) alpha[k] = alpha[k] * share[k];
       alpha[k] = where(inside[k], alpha[k]);
     }
     for (int k = 0; k < kSome; k++) {
@@ -591,27 +587,18 @@ inline void unblend_block(const LocalBrush<float>& brush, const Rim& rim, const 
   const Meeting<Lanes> m = meet(brush, px, py);
   Mask reached = both(ge(m.exponent, broadcast<Lanes>(soft ? kFaintest : rim.list_cut)),
                       gt(load(stops + at), broadcast_int(position)));
-  Nearness<Lanes> near;
-  Mask partly;
+  const Lanes one = broadcast<Lanes>(1.f);
+  Coverage<Lanes> cover;
   if constexpr (soft) {
-    near = nearness_of(brush, m);
-    partly = both(reached, gt(near.square, near.inwards * near.inwards));
-    reached = either(partly, both(reached, gt(near.inwards, broadcast<Lanes>(0.f))));
+    cover = coverage_of(brush, m);
+    reached = both(reached, gt(cover.share, broadcast<Lanes>(0.f)));
   }
   if (!bits(reached)) return;
   const Mask drawn = kWant & kThreshold && !soft
                          ? both(reached, ge(m.exponent, broadcast<Lanes>(brush.cut)))
                          : reached;
-  const Lanes one = broadcast<Lanes>(1.f);
   const Lanes uncapped = exp2(m.exponent), full = capped(uncapped, rim.alpha_max);
-  Coverage<Lanes> cover;
-  const bool rims = soft && bits(partly);
-  Lanes alpha = where(drawn, full);
-  if (rims) {
-    cover = coverage_of(near);
-    cover.share = select(partly, cover.share, one);
-    alpha = where(drawn, full * cover.share);
-  }
+  const Lanes alpha = where(drawn, soft ? full * cover.share : full);
   const Lanes inv = reciprocal(one - alpha);
   const Lanes light = load(loss.light + at) * inv;
   const Lanes behind = load(loss.behind + at);
@@ -631,7 +618,7 @@ inline void unblend_block(const LocalBrush<float>& brush, const Rim& rim, const 
   store(loss.light + at, light);
   store(loss.behind + at, fma(weight, shade, behind));
   Lanes w = uncapped * by_alpha;  // straight through the cap
-  if (rims) w = w * cover.share;
+  if (soft) w = w * cover.share;
   w = where(drawn, w);
   if (kWant & kExtra && !asked.cap_gradient)
     w = where(ge(broadcast<Lanes>(rim.alpha_max), uncapped), w);
@@ -642,21 +629,18 @@ inline void unblend_block(const LocalBrush<float>& brush, const Rim& rim, const 
   // along M (u, v).
   Lanes bend_u, bend_v;
   if constexpr (soft) {
-    bend_u = bend_v = broadcast<Lanes>(0.f);
-    if (rims) {
-      const Lanes by_share = full * by_alpha;
-      if (rim.threshold > 0) {
-        const Lanes gain = (by_share + broadcast<Lanes>(rim.per_fragment)) * cover.per_pixel;
-        sums[k] = sums[k] - where(partly, gain * broadcast<Lanes>(kLog2E / rim.threshold));
-      }
-      const Lanes edge = where(partly, by_share * cover.per_pixel * broadcast<Lanes>(kLog2E));
-      const Lanes away = cover.share - broadcast<Lanes>(0.5f);
-      const Lanes bend = where(partly, (edge + edge) * away * cover.per_pixel);
-      const Lanes along = where(partly, near.along), down = where(partly, near.down);
-      bend_u = bend * fma(along, broadcast<Lanes>(brush.scale), down * broadcast<Lanes>(brush.skew));
-      bend_v = bend * down * broadcast<Lanes>(brush.down);
-      w = w + edge;
+    const Mask partly = both(reached, gt(one, cover.share));
+    const Lanes by_share = full * by_alpha;
+    if (rim.threshold > 0) {
+      const Lanes gain = (by_share + broadcast<Lanes>(rim.per_fragment)) * cover.per_pixel;
+      sums[k] = sums[k] - where(partly, gain * broadcast<Lanes>(kLog2E / rim.threshold));
     }
+    const Lanes edge = where(partly, by_share * cover.per_pixel * broadcast<Lanes>(kLog2E));
+    const Lanes bend = (edge + edge) * (cover.share - broadcast<Lanes>(0.5f)) * cover.per_pixel;
+    bend_u = bend * fma(cover.along, broadcast<Lanes>(brush.scale),
+                        cover.down * broadcast<Lanes>(brush.skew));
+    bend_v = bend * cover.down * broadcast<Lanes>(brush.down);
+    w = w + edge;
     k++;
   } else if (kWant & kThreshold) {
     const Lanes falloff = uncapped * broadcast<Lanes>(rim.inv_opacity);

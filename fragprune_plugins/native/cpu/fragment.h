@@ -68,36 +68,22 @@ FP_HD inline V capped(V alpha, float alpha_max) {
   return min(alpha, broadcast<V>(alpha_max));
 }
 
-// Where a pixel's centre lies to a soft rim.
-template <class V>
-struct Nearness {
-  V inwards;      // how far the exponent is above the rim's
-  V along, down;  // half the exponent's gradient on the image, with the sign turned
-  V square;       // of its length: the rim is within half a pixel where it is above inwards^2
-};
-
-template <class V>
-FP_HD inline Nearness<V> nearness_of(const LocalBrush<float>& b, const Meeting<V>& m) {
-  Nearness<V> n;
-  n.inwards = m.exponent - broadcast<V>(b.cut);
-  n.along = m.u * broadcast<V>(b.scale);
-  n.down = fma(m.u, broadcast<V>(b.skew), m.v * broadcast<V>(b.down));
-  n.square = fma(n.along, n.along, n.down * n.down);
-  return n;
-}
-
-// How far a rim within half a pixel covers the pixel: its distance, to first order.
+// How far a soft rim covers a pixel: by the distance of its centre, to first order.
 template <class V>
 struct Coverage {
-  V per_pixel;  // 1 / the length of the exponent's gradient
-  V share;      // of the pixel, 0 to 1
+  V along, down;  // half the exponent's gradient on the image, with the sign turned
+  V per_pixel;    // 1 / the length of the exponent's gradient
+  V share;        // of the pixel, 0 to 1
 };
 
 template <class V>
-FP_HD inline Coverage<V> coverage_of(const Nearness<V>& n) {
+FP_HD inline Coverage<V> coverage_of(const LocalBrush<float>& b, const Meeting<V>& m) {
   Coverage<V> c;
-  c.per_pixel = 0.5f * inverse_root(max(n.square, broadcast<V>(1e-12f)));
-  c.share = fma(n.inwards, c.per_pixel, broadcast<V>(0.5f));
+  c.along = m.u * broadcast<V>(b.scale);
+  c.down = fma(m.u, broadcast<V>(b.skew), m.v * broadcast<V>(b.down));
+  const V square = fma(c.along, c.along, c.down * c.down);
+  c.per_pixel = 0.5f * inverse_root(max(square, broadcast<V>(1e-12f)));
+  c.share = fma(m.exponent - broadcast<V>(b.cut), c.per_pixel, broadcast<V>(0.5f));
   c.share = min(max(c.share, broadcast<V>(0.f)), broadcast<V>(1.f));
   return c;
 }

@@ -174,7 +174,6 @@ inline Mask gt(IntLanes a, IntLanes b) {
   return _mm512_cmpgt_epi32_mask((__m512i)a, (__m512i)b);
 }
 inline Mask both(Mask a, Mask b) { return (Mask)(a & b); }
-inline Mask either(Mask a, Mask b) { return (Mask)(a | b); }
 inline Lanes select(Mask m, Lanes a, Lanes b) { return _mm512_mask_blend_ps(m, b, a); }
 inline IntLanes select(Mask m, IntLanes a, IntLanes b) {
   return (IntLanes)_mm512_mask_blend_epi32(m, (__m512i)b, (__m512i)a);
@@ -256,7 +255,6 @@ inline Lanes inverse_root(Lanes a) {
 }
 inline Mask gt(IntLanes a, IntLanes b) { return (Mask)(a > b); }
 inline Mask both(Mask a, Mask b) { return a & b; }
-inline Mask either(Mask a, Mask b) { return a | b; }
 inline Lanes where(Mask m, Lanes a) { return bits_as<Lanes>(bits_as<IntLanes>(a) & m); }
 #if FP_LANES == 8
 inline Lanes floor(Lanes a) { return _mm256_floor_ps(a); }
