@@ -86,21 +86,12 @@ def read_draws(fork: Fork) -> None:
         fork.refuse("rasterizer-call", at, "no drawing function that a script calls", "render")
 
 
-def _given(fork: Fork, body: Function) -> Iterator[tuple[str, ast.expr]]:
-    """What scripts hand to a drawing function, also by the name that 3DGS has for it in a test."""
-    takes = fork.repo.parameters(RENDERER, body.name) or ()
-    for call in (n for tree in fork.trees.values() for n in every(tree, ast.Call)):
-        if text_of(call.func) in (body.name, "renderFunc") and call not in fork.optional:
-            several = any(isinstance(each, ast.Starred) for each in call.args)
-            values = syntax.passed(call, () if several else takes)
-            yield from ((key, value) for key, value in values.items() if not is_off(value))
-
-
 def _others(fork: Fork, body: Function) -> tuple[list[str], set[str]]:
     """How a drawing function draws other Gaussians than all of its model's own, and the options,
     off by default, that scripts hand to it and under which it does.
     """
-    given = dict(_given(fork, body))
+    scripts = (each for tree in fork.trees.values() for each in every(tree, ast.Call))
+    given = graphdeco.given_to(body, (each for each in scripts if each not in fork.optional))
     asked = {key: getattr(value, "attr", "") for key, value in given.items()}
     options = {k: v for k, v in asked.items() if reading.off_in(fork.repo, fork.command, v)}
 

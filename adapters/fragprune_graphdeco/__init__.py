@@ -41,6 +41,7 @@ from fragprune_graphdeco.call import drawing_functions as drawing_functions
 from fragprune_graphdeco.call import read_calls as read_calls
 from fragprune_graphdeco.drawing import Drawing as Drawing
 from fragprune_graphdeco.drawing import arguments as arguments
+from fragprune_graphdeco.drawing import given_to as given_to
 from fragprune_graphdeco.kernels import SURFEL as SURFEL
 from fragprune_graphdeco.plain import read_models
 from fragprune_graphdeco.syntax import assigned as assigned

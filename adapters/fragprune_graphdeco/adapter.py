@@ -340,11 +340,12 @@ class GraphdecoAdapter(ScriptAdapter):
         values = ", ".join(("the values of 3DGS", *self.drawn_from))
         found, scripts = [], map(module_of, self.scripts_of(repo))
         trees = reading.reached(repo, scripts, RENDERER).values()
+        calls = [each for tree in trees for each in every(tree, ast.Call)]
         names = dict.fromkeys(each.function for each in accepted)
         for name, body in ((name, repo.function(module, name)) for name in names):
             if body is None:
                 continue
-            on = given_to(body, trees) if self.dialect_type.rows_drawn is Dialect.rows_drawn else ()
+            on = given_to(body, calls) if self.dialect_type.rows_drawn is Dialect.rows_drawn else ()
             for call in (each for each in every(body, ast.Call) if on and arguments(each)):
                 chosen = Drawing(repo, module, body, self.drawn_from, call, on).selected()
                 found += [(name, each, "all rows") for each in chosen]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 
 from fragprune_graphdeco import reading
 from fragprune_graphdeco.call import ARGUMENTS, read_calls
@@ -84,6 +84,18 @@ def drawing_in(repo: HostRepo, module: str) -> list[ast.FunctionDef]:
     last = {each.name: each for each in body if isinstance(each, ast.FunctionDef)}
     found = [each for each in last.values() if _call(each)]
     return sorted(found, key=lambda each: (each.name != "render", not pictures(each)))
+
+
+def given_to(function: Function, calls: Iterable[ast.Call]) -> dict[str, ast.expr]:
+    """What calls of a drawing function, also by the name that 3DGS has for it in a test, give it by
+    its parameters, without what is off.
+    """
+    takes, given = [each.arg for each in function.args.args], dict[str, ast.expr]()
+    for call in (n for n in calls if text_of(n.func) in (function.name, "renderFunc")):
+        several = any(isinstance(each, ast.Starred) for each in call.args)
+        values = passed(call, () if several else takes).items()
+        given |= {key: value for key, value in values if not is_off(value)}
+    return given
 
 
 def _call(function: ast.AST, known: Known = lambda _: []) -> ast.Call | None:
