@@ -1,5 +1,6 @@
 """fragprune run, on a small host: what is said of its result, and how it is compared."""
 
+import importlib
 import json
 import logging
 import shutil
@@ -21,6 +22,9 @@ from fragprune_plugins.learning.schedule import USUAL_STOP
 from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.figures.wording import begun
 from fragprune_plugins.workbench.finetune import trial
+from fragprune_plugins.workbench.finetune.loop import LIVELY
+from fragprune_plugins.workbench.finetune.relocation import PACE, SHARE, least
+from fragprune_plugins.workbench.pruning import kept
 from fragprune_plugins.workbench.run import work
 
 WORDS = ["--device", "cpu", "--iters", 6]
@@ -285,6 +289,61 @@ def test_a_model_that_knows_photographs_by_heart_is_told(scene, tmp_path, monkey
     assert record.data["settings"]["dropout"] == trial.DROPOUT
     asked = run_json("run", "--stage", "finetune", "--dropout", 0, *WORDS, *words)
     assert (asked["gaussians"], asked["keep"], asked["forgotten"]) == (whole, None, None)
+
+
+def rates_of(monkeypatch, *words):
+    """What a run reports, and the rates of its first step, by the order of vanilla's groups."""
+    module = importlib.import_module("torch.optim.adam")  # a function hides it
+    seen, adam = [], module.adam
+
+    def noted(*args, lr, **kwargs):
+        seen.append(lr)
+        return adam(*args, lr=lr, **kwargs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "adam", noted)
+        data = run_json("run", "--device", "cpu", "--stage", "finetune", "--iters", 40, *words)
+    names = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
+    return data, dict(zip(names, seen, strict=False))
+
+
+@pytest.mark.parametrize("forgotten", [0.0, trial.BY_HEART])
+def test_stage_two_is_as_lively_as_a_fine_tuning(folder, monkeypatch, forgotten):
+    out, words = folder
+    monkeypatch.setattr(trial, "forgotten", lambda *_, **__: forgotten)
+    stays, moving = [], []
+    monkeypatch.setattr(work, "kept", lambda *a, **b: stays.append(kept(*a, **b)) or stays[-1])
+    monkeypatch.setattr(work, "least", lambda scores: moving.append(least(scores)) or moving[-1])
+    _, usual = rates_of(monkeypatch, "--control", *words)
+    data, lively = rates_of(monkeypatch, *words)
+    for name in ("f_dc", "f_rest", "scaling", "rotation"):
+        assert lively[name] == pytest.approx(LIVELY * usual[name]), name
+    assert lively["opacity"] == usual["opacity"]
+    if forgotten:
+        assert data["relocated"] == 0
+        assert not moving
+        return
+    first = load(models(out)[0]).keep(stays[0])
+    assert lively["xyz"] == pytest.approx(PACE * float(first.scaling.exp().amax(1).median()))
+    (rows,) = moving
+    assert data["relocated"] == len(rows) == int(SHARE * data["gaussians"]) > 0
+    assert any(each.startswith(f"Moved {len(rows)}") for each in begun(data))
+    after = load(data["model_after"])
+    assert len(after.thresholds) == len(after) == data["gaussians"]
+
+
+def test_gaussians_with_a_label_of_the_hosts_own_stay_where_they_are(
+    folder, scene, host, monkeypatch
+):
+    named = "        self.percent_dense = training_args.percent_dense\n"
+    label = "        self.label = torch.arange(len(self._xyz))\n"
+    edit(host / "scene/gaussian_model.py", named, named + label)
+    monkeypatch.setattr(trial, "forgotten", lambda *_, **__: 0.0)
+    words = command(scene, folder[0], "-r", 2, host=host)
+    _, usual = rates_of(monkeypatch, "--control", *words)
+    data, own = rates_of(monkeypatch, *words)
+    assert data["relocated"] == 0
+    assert own == usual
 
 
 FULL = torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")

@@ -102,7 +102,7 @@ def test_what_the_photographs_pull_at_gets_a_twin(lacking):
 
 
 def test_rows_move_in_their_order_in_the_first_third():
-    moving = Relocation(torch.tensor([5, 3]), tiny.random_model(6), 20)
+    moving = Relocation(torch.tensor([5, 3]), tiny.random_model(6).scaling, 20)
     assert [moving.moved(step) for step in (0, 1, 3, 4, 6, 20)] == [0, 0, 0, 1, 2, 2]
 
 
@@ -118,9 +118,9 @@ def test_what_is_to_go_is_never_split_and_twins_alone_lose_their_moments():
         model.xyz.grad[row] = pull / model.scaling[row].detach().exp().max()
     before = parameters(model)
     store = ThresholdStore(6)
-    moving = Relocation(torch.tensor([4, 2]), model, 20)
-    optimizer.step = lambda: None
-    moving.step(4, model, store, optimizer)
+    moving = Relocation(torch.tensor([4, 2]), model.scaling, 20)
+    with moving.stepping(4, leaves, store, optimizer.state):
+        pass
     assert torch.equal(model.f_dc[4], before["f_dc"][1])  # of all that stay 1 is pulled hardest
     for name, leaf in leaves.items():
         same = [0, 2, 3, 5]
@@ -137,10 +137,12 @@ def test_a_step_is_a_share_of_the_size_but_of_a_few_medians_at_most():
     model.scaling.copy_(torch.tensor([1.0, 2.0, 0.5, 9.0, 1.0]).log()[:, None].expand(-1, 3))
     model.scaling[:, 1:] -= 1  # the longest axis counts
     xyz = model.xyz.clone().requires_grad_()
-    moving = Relocation(torch.tensor([0]), model, 100)
+    moving = Relocation(torch.tensor([0]), model.scaling, 100)
     optimizer = torch.optim.Adam([{"params": [xyz], "lr": moving.rate}], eps=1e-15)
     xyz.grad = torch.randn(5, 3)
-    moving.step(1, replace(model, xyz=xyz), ThresholdStore(5), optimizer)
+    of = {"xyz": xyz, "scaling": model.scaling}, ThresholdStore(5), optimizer.state
+    with moving.stepping(1, *of):
+        optimizer.step()
     moved = (xyz.detach() - model.xyz).abs()  # Adam's first step is the rate, whatever pulls
     expected = PACE * torch.tensor([1.0, 2.0, 0.5, 3.0, 1.0])
     torch.testing.assert_close(moved, expected[:, None].expand(-1, 3), atol=2e-6, rtol=1e-4)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import random
 import time
 from collections.abc import Iterator, Sequence
@@ -21,7 +22,6 @@ from fragprune_plugins.learning.adam import EPSILON, stepping_fused
 from fragprune_plugins.learning.area import area_per_pixel
 from fragprune_plugins.learning.deferred import DeferredSignals, between_steps
 from fragprune_plugins.learning.events import Progress, StepStats
-from fragprune_plugins.learning.pressure import ElasticPressure
 from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.learning.thresholds import MOMENTS, ThresholdStore
 from fragprune_plugins.plugins import hookspecs
@@ -31,7 +31,7 @@ from fragprune_plugins.types import RasterInputs, RasterOutputs, one_line
 from fragprune_plugins.workbench.finetune.faster import FrameTarget, require_reach
 from fragprune_plugins.workbench.finetune.losses import code_for, photometric_loss
 from fragprune_plugins.workbench.finetune.processes import Processes, SharedStage
-from fragprune_plugins.workbench.finetune.relocation import COMPACT, DEEPER, Relocation
+from fragprune_plugins.workbench.finetune.relocation import COMPACT, Relocation, deepen
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints, configuration
 from fragprune_plugins.workbench.goals import Faster
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
@@ -41,7 +41,7 @@ from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
 # tenth of these rates for shapes cut fewer fragments at no better PSNR.
 _APPEARANCE = {"f_dc": 0.0025, "f_rest": 0.0025 / 20}
 _GEOMETRY = {"xyz": 1.6e-5, "scaling": 0.005, "rotation": 0.001}
-_LIVELY = 4.0
+LIVELY = 4.0
 """Times these rates where photographs teach all of a model with dropout, or where Gaussians move:
 docs/experiments/defaults.md. Its own pictures teach worse so: 29.75 dB in place of 29.89 on fox
 (--self --dropout 0.2)."""
@@ -141,11 +141,9 @@ class Training:
         self.relocation = None
         rates = rates_of(settings, dataset.extent, moves=relocate is not None)
         if relocate is not None:
-            self.relocation = Relocation(relocate, start, settings.iterations)
+            self.relocation = Relocation(relocate, start.scaling, settings.iterations)
             rates["xyz"] = self.relocation.rate
-            if isinstance(pressure := self.stage.pressure, ElasticPressure):
-                pressure.elasticity *= DEEPER
-                pressure.most *= DEEPER
+            deepen(self.stage.pressure)
         leaves: dict[str, Any] = {
             name: getattr(start, name)
             .detach()
@@ -327,10 +325,12 @@ class Training:
         for group in self.optimizer.param_groups:
             group["lr"] = stage.rate(group["name"], self.rates[group["name"]])
         stage.expect_sound()
-        if self.relocation is None:
+        moving: Any = contextlib.nullcontext()
+        if self.relocation is not None:
+            of = self.parameters(), stage.store, self.optimizer.state
+            moving = self.relocation.stepping(self.done + 1, *of)
+        with moving:
             self.optimizer.step()
-        else:
-            self.relocation.step(self.done + 1, self.model, stage.store, self.optimizer)
         self.optimizer.zero_grad(set_to_none=True)
         stage.end()
         self.done += 1
@@ -377,7 +377,7 @@ def rates_of(settings: Settings, extent: float, *, moves: bool) -> dict[str, flo
     if settings.train == "all":
         rates |= _GEOMETRY | {"xyz": _GEOMETRY["xyz"] * extent}
     dropout = settings.dropout and settings.train == "all" and not settings.itself
-    lively = _LIVELY if moves or dropout else 1.0
+    lively = LIVELY if moves or dropout else 1.0
     return {name: rate if name == "opacity" else lively * rate for name, rate in rates.items()}
 
 

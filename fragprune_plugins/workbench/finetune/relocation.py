@@ -8,8 +8,10 @@ Improved-GS, 2025, splits them along the longest axis.)
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,6 +19,7 @@ from torch import Tensor
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import InputError
 from fragprune_plugins.files.model import Model
+from fragprune_plugins.learning.pressure import ElasticPressure, PressureRule
 from fragprune_plugins.learning.schedule import Settings
 from fragprune_plugins.learning.thresholds import MOMENTS, ThresholdStore
 from fragprune_plugins.plugins.hooks import engine_for
@@ -38,6 +41,8 @@ COMPACT = 0.1
 
 DEEPER = 1.6
 """Times the usual default pressure, and its upper end: the better picture affords deeper cuts."""
+
+Moments = Mapping[Tensor, Mapping[str, Any]]
 
 _LARGEST = 3.0  # medians, of the size that counts: skies take steps that change much of a picture
 _ROUNDS, _FIRST, _LAST = 10, 0.05, 0.3  # of the run: what moves later has not settled at its end
@@ -73,7 +78,7 @@ class Relocation:
 
     Args:
         rows: (M,) int64, of N Gaussians those that move, the one worth least first.
-        model: the N, at least 2 M.
+        scaling: (N, 2 or 3) logarithms of the sizes of the N, at least 2 M.
         steps: of the run.
 
     Raises:
@@ -85,15 +90,15 @@ class Relocation:
             moved by its own size, summed over the views that see it, and the number of these.
     """
 
-    def __init__(self, rows: Tensor, model: Model, steps: int) -> None:
-        count = len(model)
+    def __init__(self, rows: Tensor, scaling: Tensor, steps: int) -> None:
+        count = len(scaling)
         known = rows.dtype == torch.int64 and rows.ndim == 1 and 2 * len(rows) <= count
         if not known or len(set(rows.tolist())) < len(rows) or ((rows < 0) | (rows >= count)).any():
             found = f"{rows.dtype} of shape {tuple(rows.shape)}, or a row twice, or of no Gaussian"
             expected = f"torch.int64, at most half of {count} rows, each once"
             raise InputError("relocate", found, expected, "Pass what spare(model, views) gives.")
         self._rows, self._steps = rows, steps
-        self._median = float(_sizes(model).median())
+        self._median = float(_sizes(scaling).median())
         self.rate = PACE * self._median
         self.pull = torch.zeros(2, count, device=rows.device)
 
@@ -106,23 +111,33 @@ class Relocation:
         """Whether all have moved when a step begins."""
         return self.moved(step - 1) == len(self._rows)
 
-    @torch.no_grad()
-    def step(
-        self, step: int, model: Model, store: ThresholdStore, optimizer: torch.optim.Optimizer
-    ) -> None:
-        """The optimizer's step, large Gaussians further than small ones; then some move.
+    @contextlib.contextmanager
+    def stepping(
+        self, step: int, parameters: Mapping[str, Tensor], store: ThresholdStore, state: Moments
+    ) -> Iterator[None]:
+        """Inside, the optimizer steps: large Gaussians further than small ones; then some move.
 
         Args:
             step: counted from 1.
-            model: whose parameters the optimizer moves, all of them; changed in place.
+            parameters: that the optimizer moves, by their names in a ``Model``, and whatever else
+                has a row for each Gaussian; changed in place.
+            state: of the optimizer, by parameter.
         """
-        before, sizes = model.xyz.detach().clone(), _sizes(model) / self._median
-        optimizer.step()
-        model.xyz.copy_(before.lerp(model.xyz, sizes.clamp(max=_LARGEST)[:, None]))
-        if self.over(step):
-            return
-        assert model.xyz.grad is not None
-        pull = model.xyz.grad.norm(dim=1) * _sizes(model)
+        xyz, scaling = parameters["xyz"], parameters["scaling"]
+        before, sizes = xyz.detach().clone(), _sizes(scaling) / self._median
+        yield
+        with torch.no_grad():
+            xyz.copy_(before.lerp(xyz, sizes.clamp(max=_LARGEST)[:, None]))
+            if not self.over(step):
+                self._move(step, parameters, store, state)
+
+    def _move(
+        self, step: int, parameters: Mapping[str, Tensor], store: ThresholdStore, state: Moments
+    ) -> None:
+        """Split what is pulled hardest, if some are due to move in this step."""
+        xyz = parameters["xyz"]
+        assert xyz.grad is not None
+        pull = xyz.grad.norm(dim=1) * _sizes(parameters["scaling"])
         self.pull += torch.stack([pull, (pull > 0).float()])
         leaving = self._rows[self.moved(step - 1) : self.moved(step)]
         if not len(leaving):
@@ -130,12 +145,11 @@ class Relocation:
         mean = self.pull[0] / self.pull[1].clamp(min=1)
         mean[self._rows[self.moved(step - 1) :]] = -1  # what is to go itself
         wholes = mean.topk(len(leaving)).indices
-        parameters = {group["name"]: group["params"][0] for group in optimizer.param_groups}
         split(parameters, wholes, leaving)
         twins = torch.cat([wholes, leaving])
         for parameter in parameters.values():
             for moment in MOMENTS:
-                optimizer.state[parameter][moment][twins] = 0
+                state[parameter][moment][twins] = 0
         origins = torch.arange(len(store), device=twins.device)
         fresh = torch.isin(origins, twins)
         origins[leaving] = wholes
@@ -143,9 +157,16 @@ class Relocation:
         self.pull.zero_()
 
 
-def _sizes(model: Model) -> Tensor:
+def deepen(pressure: PressureRule) -> None:
+    """Raise the usual default pressure of a run in which Gaussians move."""
+    if isinstance(pressure, ElasticPressure):
+        pressure.elasticity *= DEEPER
+        pressure.most *= DEEPER
+
+
+def _sizes(scaling: Tensor) -> Tensor:
     """(N,) the longest axes."""
-    return model.scaling.detach().exp().amax(dim=1)
+    return scaling.detach().exp().amax(dim=1)
 
 
 def split(parameters: Mapping[str, Tensor], wholes: Tensor, others: Tensor) -> None:

@@ -11,7 +11,7 @@ import logging
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,15 +27,18 @@ from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.injection import launch, process
 from fragprune_plugins.learning.schedule import Settings
+from fragprune_plugins.plugins.loading import installed
 from fragprune_plugins.types import RasterInputs, RasterOutputs
 from fragprune_plugins.workbench.commands import logs, opening
 from fragprune_plugins.workbench.commands.command import JSON, Report
 from fragprune_plugins.workbench.commands.options import EngineOptions
 from fragprune_plugins.workbench.figures import evaluate, matching, records, wording
+from fragprune_plugins.workbench.finetune.relocation import least, relocates
 from fragprune_plugins.workbench.finetune.trial import Trial, tried
 from fragprune_plugins.workbench.models.model import load
-from fragprune_plugins.workbench.pruning import kept
+from fragprune_plugins.workbench.pruning import kept, scored
 from fragprune_plugins.workbench.run.afterwards import train_then_finetune
+from fragprune_plugins.workbench.run.lively import Lively
 from fragprune_plugins.workbench.run.unserved import Unserved, unserved
 from fragprune_plugins.workbench.scenes import generated, output, training
 
@@ -80,8 +83,13 @@ def run(
     # A host prints to stdout; with --json, stdout gets only our object.
     with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
         warmup = 0 if stage == "joint" else settings.warmup
-        with logs.logging_steps([logs.Bar(settings.iterations, warmup)]):
-            summary = _launched(host_command, options)
+        plugins = installed()
+        plugins.register(looking.lively, "lively")
+        try:
+            with logs.logging_steps([logs.Bar(settings.iterations, warmup)]):
+                summary = _launched(host_command, options)
+        finally:
+            plugins.remove("lively")
         if isinstance(summary, Unserved):
             return train_then_finetune(summary, stage, settings, engine, again=again, json=as_json)
         _expect_steps(summary, options)
@@ -219,6 +227,7 @@ def figures_of(
         "model_after": summary.model_after and str(summary.model_after),
         "seen": looking.seen,
         "keep": trial and trial.keep,
+        "relocated": looking.lively.relocated,
         "forgotten": trial and trial.forgotten,
         "pressure": summary.curves[-1]["pressure"] if summary.curves else None,
         "seed": settings.seed,
@@ -338,6 +347,7 @@ class Looking:
     trial: Trial | None = None  # None where nothing could be tried
     gaussians: int = 0  # that the model had
     seen: bool = False  # whether the training of stage 1 has seen held-out views
+    lively: Lively = field(default_factory=Lively)
 
     def __call__(
         self, ply: Path, photographs: Photographs, drawing: Mapping[str, Any], settings: Settings
@@ -362,13 +372,18 @@ class Looking:
         rasterizer, device = opening.open_engine(self.engine)
         engine = _AsTheHost(rasterizer.name, rasterizer, drawing)
         model = load(ply, filtered=True, device=device)
+        self.lively.on, self.lively.rows = False, None
         _, dataset = matching.told_or_matched(model, photographs, engine)
         self.seen |= training.saw_held_out(ply, dataset)
         trial, left = tried(model, dataset, settings, engine=engine, say=log.info), None
         if trial.keep is not None:
             shots = dataset.train
             views = generated.views_near(shots, seed=settings.seed)
-            left = kept(model, trial.keep, shots, views, engine=engine).cpu()
+            scores = scored(model, views, engine=engine, progress=False)
+            left = kept(model, trial.keep, shots, views, engine=engine, scores=scores).cpu()
+            if trial.keep == "auto" and relocates(model, trial.settings):
+                self.lively.rows = least(scores.cpu()[left])
+        self.lively.on = self.lively.rows is not None or bool(trial.settings.dropout)
         self.trial, self.gaussians = trial, len(model.xyz)
         return trial.settings, left
 

@@ -1,0 +1,121 @@
+"""Stage 2 of a host, as lively as a fine-tuning: at its rates, and with Gaussians that move.
+
+A host's stage 2 takes its own steps. Those of a model whose PLY shows all that its host draws are
+larger here, as ``fragprune finetune`` has them, and Gaussians move between some of them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import weakref
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from fragprune_plugins.injection.session import active_session
+from fragprune_plugins.injection.state import SessionState
+from fragprune_plugins.learning.stage2 import Stage2
+from fragprune_plugins.learning.thresholds import ThresholdStore
+from fragprune_plugins.plugins.hookspecs import hookimpl
+from fragprune_plugins.workbench.finetune.loop import LIVELY
+from fragprune_plugins.workbench.finetune.relocation import Relocation, deepen
+
+_NAMES = {"xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation"}
+_POSITIONS = 0.1  # of a host's first rate, at which those of a trained model still find better ones
+_STATISTICS = ("max_radii", "grad", "denom")  # in names of what densification alone reads
+
+
+@dataclass
+class Lively:
+    """A plugin for one run, which does nothing unless ``on``.
+
+    Attributes:
+        on: whether stage 2 learns at the rates of a fine-tuning.
+        rows: (M,) int64, the Gaussians that may move, see ``Relocation``; None for none.
+        relocated: Gaussians that have moved.
+    """
+
+    on: bool = False
+    rows: Tensor | None = None
+    relocated: int = 0
+
+    @hookimpl
+    def fragprune_attached(self, model: Any, store: ThresholdStore) -> None:
+        """Follow the optimizer of the positions of a model that trains, from its first step on."""
+        session = active_session()
+        state = session.models.get(model) if session and session.learn else None
+        if not self.on or session is None or state is None or state.stage is None:
+            return
+        for optimizer in filter(None, (known() for known in session.optimizers[model])):
+            names = {session.adapter.group_name(model, each) for each in optimizer.param_groups}
+            if names >= _NAMES:
+                lively = _Steps(self, session, weakref.ref(model), state.stage)
+                state.hooks.append(optimizer.register_step_pre_hook(lively.before))
+                state.hooks.append(optimizer.register_step_post_hook(lively.after))
+
+
+class _Steps:
+    """The steps of one optimizer: the host's own, but for their rates, and for what moves."""
+
+    def __init__(self, of: Lively, session: SessionState, model: Any, stage: Stage2) -> None:
+        self.of, self.session, self.model, self.stage = of, session, model, stage
+        self.rates: dict[str, float] | None = None  # at first; not known before the first step
+        self.relocation: Relocation | None = None
+        self.after_it = contextlib.ExitStack()
+
+    def before(self, optimizer: torch.optim.Optimizer, *_: Any) -> None:
+        """Lend the rates of this step, and look where the Gaussians are."""
+        model, stage = self.model(), self.stage
+        if model is None or stage.plan is None:
+            return
+        named = ((self.session.adapter.group_name(model, g), g) for g in optimizer.param_groups)
+        groups = {name: group for name, group in named if name}
+        if self.rates is None:
+            self.rates = self._begin(model, groups)
+        for name, rate in self.rates.items():
+            self.after_it.callback(groups[name].update, lr=groups[name]["lr"])
+            groups[name]["lr"] = stage.rate(name, rate)
+        if self.relocation is not None:
+            of = _rows(groups, stage.store), stage.store, optimizer.state
+            self.after_it.enter_context(self.relocation.stepping(stage.steps, *of))
+
+    def _begin(self, model: Any, groups: Mapping[str, dict[str, Any]]) -> dict[str, float]:
+        """The rates of stage 2 at its first step, by name; none where the host's own stay."""
+        rows, moving = _rows(groups, self.stage.store), self.of.rows
+        rates = {name: LIVELY * self.session.rates[model][name] for name in _NAMES - {"opacity"}}
+        rates["xyz"] *= _POSITIONS
+        if moving is not None:
+            if not _is_all(model, rows):
+                return {}
+            moving = moving.to(self.stage.store.logits.device)
+            steps = self.session.settings.iterations
+            self.relocation = Relocation(moving, rows["scaling"], steps)
+            rates["xyz"] = self.relocation.rate
+            deepen(self.stage.pressure)
+        return rates
+
+    def after(self, *_: Any) -> None:
+        """Take back the rates; some Gaussians move."""
+        self.after_it.close()
+        if self.relocation is not None:
+            self.of.relocated = self.relocation.moved(self.stage.steps)
+
+
+def _rows(groups: Mapping[str, dict[str, Any]], store: ThresholdStore) -> dict[str, Tensor]:
+    """What has a row for each Gaussian, of the parameters, by name."""
+    parameters = {name: group["params"][0] for name, group in groups.items()}
+    return {name: each for name, each in parameters.items() if each.shape[:1] == (len(store),)}
+
+
+def _is_all(model: Any, rows: Mapping[str, Tensor]) -> bool:
+    """Whether these are all that a model holds for each Gaussian, but for statistics.
+
+    What else it holds, such as a label, would stay with the row from which a Gaussian moved.
+    """
+    known, count = {id(each) for each in rows.values()}, len(rows["xyz"])
+    held = ((name, each) for name, each in vars(model).items() if isinstance(each, Tensor))
+    further = [name for name, each in held if each.shape[:1] == (count,) and id(each) not in known]
+    return all(any(word in name for word in _STATISTICS) for name in further)
