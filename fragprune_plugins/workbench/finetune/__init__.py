@@ -124,7 +124,7 @@ def command(**options: Any) -> Report | None:
     --pressure 1.5e-4.
 
     A MODEL that knows its photographs by heart shows them much better than what lies between them.
-    100 steps on half of them tell: if the others get worse by 0.04 dB, --dropout 0.2 --keep 0.6
+    100 steps on half of them tell: if the others get worse by 0.05 dB, --dropout 0.2 --keep 0.6
     keep cutoffs from suiting the photographs alone; if not, --keep auto removes what they can
     spare, and moves other Gaussians to where some are missing.
 
