@@ -148,9 +148,12 @@ def test_report_shows_the_demos_folder(demo, tmp_path):
     assert (report["command"], report["adapter"]) == ("run", "vanilla-3dgs")
     assert report["after"] == demos["after"]
     assert report["result"].endswith(outcome("run", demos, demos["control"]))
-    (note,) = report["notes"]
-    assert note in (out / "index.html").read_text()
-    assert "Gaussians before learning" in note
+    removed, moved = report["notes"]
+    page = (out / "index.html").read_text()
+    assert removed in page
+    assert moved in page
+    assert "Gaussians before learning" in removed
+    assert "of the others to where some were missing" in moved
     assert len(report["views"]) > 0
     text = (tmp_path / "page.html").read_text()
     assert text.count('src="data:image/png;base64,') == report["pictures"] > 7

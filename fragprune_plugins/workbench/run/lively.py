@@ -20,6 +20,7 @@ from fragprune_plugins.injection.state import SessionState
 from fragprune_plugins.learning.stage2 import Stage2
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins.hookspecs import hookimpl
+from fragprune_plugins.types import one_line
 from fragprune_plugins.workbench.finetune.loop import LIVELY
 from fragprune_plugins.workbench.finetune.relocation import Relocation, deepen
 
@@ -28,7 +29,7 @@ _POSITIONS = 0.1  # of a host's first rate, at which those of a trained model st
 _STATISTICS = ("max_radii", "grad", "denom")  # in names of what densification alone reads
 
 
-@dataclass
+@dataclass(eq=False)
 class Lively:
     """A plugin for one run, which does nothing unless ``on``.
 
@@ -41,6 +42,8 @@ class Lively:
     on: bool = False
     rows: Tensor | None = None
     relocated: int = 0
+
+    __repr__ = one_line
 
     @hookimpl
     def fragprune_attached(self, model: Any, store: ThresholdStore) -> None:
