@@ -119,8 +119,10 @@ def test_what_is_to_go_is_never_split_and_twins_alone_lose_their_moments():
     before = parameters(model)
     store = ThresholdStore(6)
     moving = Relocation(torch.tensor([4, 2]), model.scaling, 20)
-    with moving.stepping(4, leaves, store, optimizer.state):
+    idle = torch.arange(6.0)  # a host's parameter that no loss has moved yet
+    with moving.stepping(4, leaves | {"idle": idle}, store, optimizer.state):
         pass
+    assert idle.tolist() == [0, 1, 2, 3, 1, 5]
     assert torch.equal(model.f_dc[4], before["f_dc"][1])  # of all that stay 1 is pulled hardest
     for name, leaf in leaves.items():
         same = [0, 2, 3, 5]

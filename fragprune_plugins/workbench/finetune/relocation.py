@@ -148,8 +148,9 @@ class Relocation:
         split(parameters, wholes, leaving)
         twins = torch.cat([wholes, leaving])
         for parameter in parameters.values():
-            for moment in MOMENTS:
-                state[parameter][moment][twins] = 0
+            known = state.get(parameter, {})  # nothing, if no loss has moved it
+            for moment in MOMENTS.keys() & known.keys():
+                known[moment][twins] = 0
         origins = torch.arange(len(store), device=twins.device)
         fresh = torch.isin(origins, twins)
         origins[leaving] = wholes
