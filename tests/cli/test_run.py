@@ -408,20 +408,26 @@ def test_a_stage_two_that_reads_photographs_otherwise_says_so(scene, tmp_path, c
     assert "its training had another resolution, white_background, eval (cfg_args)" in caplog.text
 
 
-def test_what_cannot_be_compared_says_why(scene, tmp_path):
+def test_without_eval_every_eighth_view_that_was_trained_on_is_measured(scene, tmp_path):
     words = command(scene, tmp_path / "out", "--densify_until_iter", 8)
     words.remove("--eval")
-    result = run("run", *WORDS, *words)
-    why = "because of the host's command: no --eval"
-    assert f"Not compared on held-out views {why}" in result.stdout
-    assert "fragprune compare" not in result.stdout
+    said = run("run", *WORDS, *words).stdout
+    assert "that its training had seen" in said
+    assert "The host held no view out" in said
     (record,) = records.find(tmp_path / "out")
-    assert record.data["before"] is None
-    assert record.data["not_compared"]["code"] == "not-compared"
-    assert record.data["gaussians_before"] == record.data["gaussians"] > 0  # it was looked at
-    assert begun(record.data) == []
-    (said,) = begun(record.data | {"keep": 0.6, "gaussians_before": 300})
-    assert "of 300 Gaussians" in said
+    data = record.data
+    assert data["seen"]
+    assert data["not_compared"] is None
+    assert data["before"]["views"] == data["after"]["views"] == 1
+    assert min(data["before"]["frame_ms"], data["after"]["frame_ms"]) > 0
+    assert " held out" not in run_json("report", tmp_path / "out")["result"]
+
+
+def test_without_eval_joint_learning_says_that_its_views_were_seen(scene, tmp_path):
+    words = command(scene, tmp_path / "out", "--iterations", 24, "--densify_until_iter", 12)
+    words.remove("--eval")
+    said = run("run", "--device", "cpu", "--stage", "joint", *words).stdout
+    assert "The host held no view out" in said
 
 
 def test_a_host_that_raises_leaves_one_json_object_on_stdout(host, tmp_path):

@@ -108,6 +108,15 @@ def test_a_missed_target_is_a_part_of_the_result(control):
     assert "target" not in outcome("finetune", data() | TARGET | {"target_reached": True}, control)
 
 
+def test_a_model_that_unlearns_photographs_it_had_seen_is_no_reason_to_warn():
+    """Dropout makes it worse on these, and better on others."""
+    seen = data() | {"after": AFTER | {"psnr": 25.0}, "seen": True}
+    dropout = {"goal": "pressure", "dropout": 0.4}
+    assert "Warning" in outcome("run", seen, CONTROL)
+    assert "Warning" not in outcome("run", seen | {"settings": dropout}, CONTROL)
+    assert "Warning" in outcome("run", seen | {"seen": False, "settings": dropout}, CONTROL)
+
+
 @pytest.mark.parametrize(
     ("after", "control", "warning"),
     [
@@ -174,6 +183,12 @@ def test_a_table_says_in_words_what_a_ratio_means(before, after, change, frame):
 def test_a_record_of_before_there_were_trials_says_nothing_of_one():
     before, after = {"gaussians": 9}, {"gaussians": 9}
     assert begun({"settings": {}, "before": before, "after": after}) == []
+
+
+def test_gaussians_removed_are_told_where_nothing_was_measured():
+    data = {"settings": {}, "keep": 0.6, "gaussians_before": 300, "gaussians": 180, "before": None}
+    (said,) = begun(data)
+    assert said.startswith("Removed 120 of 300 Gaussians")
 
 
 @pytest.mark.skipif(os.name == "nt", reason="shells of Windows take other words")

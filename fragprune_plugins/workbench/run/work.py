@@ -50,6 +50,10 @@ _CONTROL = (  # joint learning has no model of before
     "To see what pruning did, train as long with --stage off and another output folder, and run "
     "fragprune compare."
 )
+_ALL_SEEN = (
+    "The host held no view out, so these figures are of views that it learned from; those of "
+    "others are lower. To see them, train with --eval, from stage 1 on."
+)
 
 
 def run(
@@ -95,7 +99,7 @@ def run(
         _expect_steps(summary, options)
         _expect_thresholds(summary, settings)
         photographs = photographs_of(summary)
-        not_compared = _not_compared(summary)
+        not_compared: FragpruneError | None = summary.not_compared
         if photographs:
             try:
                 with process.current_gpu(engine.device), _enough_memory():
@@ -135,15 +139,6 @@ def _of_other_options(summary: launch.RunSummary, command: Sequence[str]) -> boo
     record = records.beside(summary.model_after)
     then = record and record.data.get("host_options")
     return then is not None and then != _options(command)
-
-
-def _not_compared(summary: launch.RunSummary) -> FragpruneError | None:
-    """Why its models are not measured on held-out views; None if they can be."""
-    if summary.photographs is None or summary.photographs.held_out:
-        return summary.not_compared
-    where, found = "the host's command", "no --eval: every view is trained on"
-    remedy = "Train with --eval, from stage 1 on."
-    return NotComparedError(where, found, "views that are held out", remedy)
 
 
 def _expect_steps(summary: launch.RunSummary, options: launch.RunOptions) -> None:
@@ -212,7 +207,7 @@ def figures_of(
     host_command: Sequence[str] = (),
 ) -> dict[str, Any]:
     """What --json prints of a run, from its measurements on held-out views."""
-    trial = looking.trial
+    trial, read = looking.trial, summary.photographs
     data: dict[str, Any] = {name: getattr(summary, name) for name in _OF_SUMMARY} | {
         "iterations": summary.steps,
         "gaussians_before": looking.gaussians,
@@ -225,7 +220,7 @@ def figures_of(
         "not_compared": not_compared and not_compared.as_dict(),
         "model_before": summary.model_before and str(summary.model_before),
         "model_after": summary.model_after and str(summary.model_after),
-        "seen": looking.seen,
+        "seen": looking.seen or (read is not None and not read.held_out),
         "keep": trial and trial.keep,
         "relocated": looking.lively.relocated,
         "forgotten": trial and trial.forgotten,
@@ -246,13 +241,17 @@ def _options(command: Sequence[str]) -> list[str]:
 
 
 def photographs_of(summary: launch.RunSummary) -> records.Recorded | None:
-    """How to read the host's data and draw its models; None if they cannot be, or are measured."""
-    if not summary.photographs or not summary.photographs.held_out:
+    """How to read the host's data and draw its models; None if they cannot be, or are measured.
+
+    A host that holds nothing out is measured on the views that ``--eval`` would hold out.
+    """
+    if not summary.photographs:
         return None
     if summary.already_finished and summary.model_after and records.beside(summary.model_after):
         return None
     left = tuple(path for path in (summary.model_before, summary.model_after) if path)
-    return records.Recorded(summary.photographs, left, filtered=True, drawing=summary.drawing)
+    read = replace(summary.photographs, held_out=True)
+    return records.Recorded(read, left, filtered=True, drawing=summary.drawing)
 
 
 def measure_models(
@@ -294,6 +293,8 @@ def _describe(summary: launch.RunSummary, data: dict[str, Any]) -> str:
         if data["not_compared"]:
             why = "{where}: {found}. {remedy}".format(**data["not_compared"])
             lines.append(f"Not compared on held-out views because of {why}")
+    if data["after"] and summary.photographs and not summary.photographs.held_out:
+        lines.append(_ALL_SEEN)
     pressure = f" at pressure {summary.curves[-1]['pressure']:.2g}" if summary.curves else ""
     within = "inside the training" if summary.stage == "joint" else "of stage 2"
     saved: Path | str | None = summary.model_after
