@@ -291,8 +291,11 @@ def test_a_model_that_knows_photographs_by_heart_is_told(scene, tmp_path, monkey
     assert (asked["gaussians"], asked["keep"], asked["forgotten"]) == (whole, None, None)
 
 
-def rates_of(monkeypatch, *words):
-    """What a run reports, and the rates of its first step, by the order of vanilla's groups."""
+NAMES = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")  # vanilla's order of groups
+
+
+def rates_of(monkeypatch, *words, names=NAMES):
+    """What a run reports, and the rates of its first step, which takes these in their order."""
     module = importlib.import_module("torch.optim.adam")  # a function hides it
     seen, adam = [], module.adam
 
@@ -303,7 +306,6 @@ def rates_of(monkeypatch, *words):
     with monkeypatch.context() as patch:
         patch.setattr(module, "adam", noted)
         data = run_json("run", "--device", "cpu", "--stage", "finetune", "--iters", 40, *words)
-    names = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
     return data, dict(zip(names, seen, strict=False))
 
 
@@ -330,6 +332,40 @@ def test_stage_two_is_as_lively_as_a_fine_tuning(folder, monkeypatch, forgotten)
     assert any(each.startswith(f"Moved {len(rows)}") for each in begun(data))
     after = load(data["model_after"])
     assert len(after.thresholds) == len(after) == data["gaussians"]
+
+
+def test_a_host_with_two_optimizers_is_as_lively(folder, scene, host, monkeypatch):
+    setup = "        self.optimizer = torch.optim.Adam(groups, lr=0.0, eps=1e-15)\n"
+    apart = "        self.shs = torch.optim.Adam([groups.pop(2)], lr=0.0, eps=1e-15)\n"
+    edit(host / "scene/gaussian_model.py", setup, apart + setup)
+    step = "                gaussians.optimizer.step()\n"
+    edit(host / "train.py", step, step + step.replace("optimizer", "shs"))
+    words = command(scene, folder[0] / "anew", "-r", 2, "--densify_until_iter", 0, host=host)
+    words += ["--checkpoint_iterations", 10]  # from its PLY, ours has the groups of one
+    run_json("run", "--device", "cpu", "--stage", "off", *words)
+    monkeypatch.setattr(trial, "forgotten", lambda *_, **__: 0.0)
+    names = ("xyz", "f_dc", "opacity", "scaling", "rotation", "thresholds", "f_rest")
+    data, lively = rates_of(monkeypatch, *words, names=names)
+    assert data["relocated"] > 0
+    assert lively["rotation"] == pytest.approx(LIVELY * 0.001)
+    assert lively["f_rest"] == pytest.approx(LIVELY * 0.0025 / 20)
+
+
+def test_rates_are_lent_for_a_step_alone(folder, scene, host, monkeypatch):
+    """The host saves its rates in its checkpoints."""
+    out = folder[0]
+    step = "                gaussians.optimizer.step()\n"
+    noted = (
+        "                torch.save([g['lr'] for g in gaussians.optimizer.param_groups], RATES)\n"
+    )
+    edit(host / "train.py", step, step + noted.replace("RATES", repr(str(out / "rates.pt"))))
+    monkeypatch.setattr(trial, "forgotten", lambda *_, **__: 0.0)
+    words, after = command(scene, out, "-r", 2, host=host), []
+    for more in ("--control",), ():
+        data, _ = rates_of(monkeypatch, *more, *words)
+        after.append(torch.load(out / "rates.pt"))
+    assert data["relocated"] > 0
+    assert after[0] == after[1]
 
 
 def test_gaussians_with_a_label_of_the_hosts_own_stay_where_they_are(

@@ -148,6 +148,8 @@ class Relocation:
         split(parameters, wholes, leaving)
         twins = torch.cat([wholes, leaving])
         for parameter in parameters.values():
+            if parameter.grad is not None:  # of an optimizer that has still to step
+                parameter.grad[twins] = 0
             known = state.get(parameter, {})  # nothing, if no loss has moved it
             for moment in MOMENTS.keys() & known.keys():
                 known[moment][twins] = 0

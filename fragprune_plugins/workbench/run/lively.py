@@ -47,21 +47,23 @@ class Lively:
 
     @hookimpl
     def fragprune_attached(self, model: Any, store: ThresholdStore) -> None:
-        """Follow the optimizer of the positions of a model that trains, from its first step on."""
+        """Follow the optimizers of a model that trains, from its first step on."""
         session = active_session()
         state = session.models.get(model) if session and session.learn else None
         if not self.on or session is None or state is None or state.stage is None:
             return
-        for optimizer in filter(None, (known() for known in session.optimizers[model])):
-            names = {session.adapter.group_name(model, each) for each in optimizer.param_groups}
-            if names >= _NAMES:
-                lively = _Steps(self, session, weakref.ref(model), state.stage)
+        if {name for name, _ in session.groups(model)} >= _NAMES:
+            lively = _Steps(self, session, weakref.ref(model), state.stage)
+            for optimizer in filter(None, (known() for known in session.optimizers[model])):
                 state.hooks.append(optimizer.register_step_pre_hook(lively.before))
                 state.hooks.append(optimizer.register_step_post_hook(lively.after))
 
 
 class _Steps:
-    """The steps of one optimizer: the host's own, but for their rates, and for what moves."""
+    """The steps of a model's optimizers: the host's own, but for their rates, and for what moves.
+
+    Gaussians move with the step of the optimizer that has their positions.
+    """
 
     def __init__(self, of: Lively, session: SessionState, model: Any, stage: Stage2) -> None:
         self.of, self.session, self.model, self.stage = of, session, model, stage
@@ -74,20 +76,24 @@ class _Steps:
         model, stage = self.model(), self.stage
         if model is None or stage.plan is None:
             return
-        named = ((self.session.adapter.group_name(model, g), g) for g in optimizer.param_groups)
-        groups = {name: group for name, group in named if name}
         if self.rates is None:
-            self.rates = self._begin(model, groups)
-        for name, rate in self.rates.items():
-            self.after_it.callback(groups[name].update, lr=groups[name]["lr"])
-            groups[name]["lr"] = stage.rate(name, rate)
-        if self.relocation is not None:
-            of = _rows(groups, stage.store), stage.store, optimizer.state
+            self.rates = self._begin(model)
+        lent = self.session.models[model].lent[-1]  # what the session takes back after the step
+        known = {id(group) for group, _ in lent}
+        mine = [(self.session.adapter.group_name(model, g), g) for g in optimizer.param_groups]
+        for name, group in mine:
+            if name in self.rates:
+                lent += [(group, group["lr"])] * (id(group) not in known)
+                group["lr"] = stage.rate(name, self.rates[name])
+        if self.relocation is not None and "xyz" in dict(mine):
+            optimizers = (each() for each in self.session.optimizers[model])
+            moments = {k: each for o in optimizers if o is not None for k, each in o.state.items()}
+            of = self._rows(model), stage.store, moments
             self.after_it.enter_context(self.relocation.stepping(stage.steps, *of))
 
-    def _begin(self, model: Any, groups: Mapping[str, dict[str, Any]]) -> dict[str, float]:
+    def _begin(self, model: Any) -> dict[str, float]:
         """The rates of stage 2 at its first step, by name; none where the host's own stay."""
-        rows, moving = _rows(groups, self.stage.store), self.of.rows
+        rows, moving = self._rows(model), self.of.rows
         rates = {name: LIVELY * self.session.rates[model][name] for name in _NAMES - {"opacity"}}
         rates["xyz"] *= _POSITIONS
         if moving is not None:
@@ -100,17 +106,18 @@ class _Steps:
             deepen(self.stage.pressure)
         return rates
 
-    def after(self, *_: Any) -> None:
-        """Take back the rates; some Gaussians move."""
+    def _rows(self, model: Any) -> dict[str, Tensor]:
+        """What has a row for each Gaussian, of the parameters, by name or number."""
+        groups = enumerate(self.session.groups(model))
+        known = {name or f"{number}": group["params"][0] for number, (name, group) in groups}
+        count = (len(self.stage.store),)
+        return {name: each for name, each in known.items() if each.shape[:1] == count}
+
+    def after(self, optimizer: torch.optim.Optimizer, *_: Any) -> None:
+        """Some Gaussians move."""
         self.after_it.close()
         if self.relocation is not None:
             self.of.relocated = self.relocation.moved(self.stage.steps)
-
-
-def _rows(groups: Mapping[str, dict[str, Any]], store: ThresholdStore) -> dict[str, Tensor]:
-    """What has a row for each Gaussian, of the parameters, by name."""
-    parameters = {name: group["params"][0] for name, group in groups.items()}
-    return {name: each for name, each in parameters.items() if each.shape[:1] == (len(store),)}
 
 
 def _is_all(model: Any, rows: Mapping[str, Tensor]) -> bool:
