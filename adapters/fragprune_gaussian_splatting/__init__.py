@@ -12,7 +12,7 @@ from argparse import ArgumentParser
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NoReturn
+from typing import Any
 
 from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall, rasterizer_seam
 from fragprune_plugins.adapting import (
@@ -24,6 +24,7 @@ from fragprune_plugins.adapting import (
     HostInfo,
     HostRepo,
     NotComparedError,
+    Photographs,
     Role,
     Seam,
     SeamCall,
@@ -145,24 +146,24 @@ class GaussianSplatting(GraphdecoAdapter):
             in_full=super().command_line(repo).in_full,
         )
 
-    def photographs(self, repo: HostRepo, arguments: list[str]) -> NoReturn:
-        """Refuse: the package trains on every view."""
-        where, found = "gaussian-splatting (pip)", "a package that trains on every view"
-        remedy = (
-            "Leave some views out of the COLMAP model, then run fragprune compare on all of them."
-        )
-        raise NotComparedError(where, found, "views that are held out", remedy)
+    def photographs(self, repo: HostRepo, arguments: list[str]) -> Photographs:
+        """All photographs, as they are: it trains on every view."""
+        folder = Path(self.command_line(repo).read(arguments).source or "")
+        masks = folder / "image_masks"
+        found = "cameras that it trains" if _cameras(arguments)[0] else ""
+        if "--no_image_mask" not in arguments and masks.is_dir():
+            found = f"photographs under the masks in {masks}"
+        if found:
+            expected = "photographs and cameras of a COLMAP scene, as they are"
+            remedy = "Leave some views out of the COLMAP model; fragprune compare measures those."
+            raise NotComparedError("gaussian-splatting (pip)", found, expected, remedy)
+        return Photographs(folder, centred=True, opaque=True, held_out=False)
 
     def resumed_by(self, script: Path, arguments: list[str]) -> tuple[Path, list[str]]:
         """The command for stage 2; if cameras were trained, it takes those of stage 1."""
-        parser = ArgumentParser(add_help=False)
-        parser.add_argument("--mode", default="")
-        parser.add_argument("--load_camera")
-        parser.add_argument("-d", "--destination")
-        known, _ = parser.parse_known_args(arguments)
-        trained = "camera" in known.mode and not known.load_camera and known.destination
-        cameras = Path(known.destination) / "cameras.json" if trained else None
-        return script, [*arguments, *(["--load_camera", str(cameras)] if cameras else [])]
+        own, written = _cameras(arguments)
+        more = ["--load_camera", str(written)] if own and written else []
+        return script, [*arguments, *more]
 
     def model_of(self, call: SeamCall) -> Any:
         """The model of a trainer, or the argument from which a trainer is being made."""
@@ -176,3 +177,15 @@ class GaussianSplatting(GraphdecoAdapter):
     def view(self, camera: Any) -> int:
         """A key of the camera: its matrix. Cameras are tuples, which hosts copy."""
         return id(camera.world_view_transform)
+
+
+def _cameras(arguments: list[str]) -> tuple[bool, Path | None]:
+    """Whether cameras are not the scene's own, and where a training writes those it trained."""
+    parser = ArgumentParser(add_help=False)
+    parser.add_argument("--mode", default="")
+    parser.add_argument("--load_camera")
+    parser.add_argument("-d", "--destination")
+    known, _ = parser.parse_known_args(arguments)
+    trained = "camera" in known.mode and not known.load_camera and known.destination
+    own = "camera" in known.mode or bool(known.load_camera)
+    return own, Path(known.destination) / "cameras.json" if trained else None

@@ -348,6 +348,12 @@ def test_the_size_of_photographs_is_the_hosts(data, model, tmp_path, asked, size
     assert read == Photographs(data, size, True, "images_8", centred=True, opaque=True)
 
 
+def test_a_training_without_an_argument_for_their_size_reads_photographs_as_they_are(output):
+    known = output / "cfg_args"
+    known.write_text(f"Namespace(sh_degree=1, source_path={str(output)!r})")
+    assert trained_on(newest_model(output)).resolution == Resolution()
+
+
 @pytest.mark.parametrize(("known", "opaque"), [({}, False), ({"train_test_exp": False}, True)])
 def test_3dgs_since_october_2024_drops_the_alpha_of_blenders_images(model, tmp_path, known, opaque):
     (tmp_path / "scene").mkdir()

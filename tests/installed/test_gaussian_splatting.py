@@ -11,7 +11,13 @@ import torch
 
 from fragprune_gaussian_splatting import GaussianSplatting
 from fragprune_graphdeco import photographs as reading_of_photographs
-from fragprune_plugins.adapting import HostRepo, SessionError, read_ply
+from fragprune_plugins.adapting import (
+    HostRepo,
+    NotComparedError,
+    Photographs,
+    SessionError,
+    read_ply,
+)
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.hosts.choosing import attempt
 from fragprune_plugins.injection.launch import RunOptions, run
@@ -64,6 +70,20 @@ def test_another_backend_is_refused_by_name():
 def test_stage_2_goes_on_with_the_cameras_that_stage_1_trained(words, added):
     script, arguments = GaussianSplatting().resumed_by(Path("train.py"), words)
     assert (script, arguments) == (Path("train.py"), words + added)
+
+
+def test_photographs_are_read_as_they_are_unless_it_changes_cameras_or_masks_them(tmp_path):
+    adapter, repo = GaussianSplatting(), HostRepo.installed("gaussian_splatting")
+    words = ["-s", str(tmp_path), "-d", "out"]
+    whole = Photographs(tmp_path, centred=True, opaque=True, held_out=False)
+    assert adapter.photographs(repo, [*words, "--mode", "densify"]) == whole
+    for more in ("--mode", "camera-densify"), ("--load_camera", "cameras.json"):
+        with pytest.raises(NotComparedError, match="cameras that it trains"):
+            adapter.photographs(repo, [*words, *more])
+    (tmp_path / "image_masks").mkdir()
+    with pytest.raises(NotComparedError, match="under the masks"):
+        adapter.photographs(repo, words)
+    assert adapter.photographs(repo, [*words, "--no_image_mask"]) == whole
 
 
 @pytest.mark.parametrize("mode", ["densify", "camera"])

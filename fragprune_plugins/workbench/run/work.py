@@ -52,7 +52,7 @@ _CONTROL = (  # joint learning has no model of before
 )
 _ALL_SEEN = (
     "The host held no view out, so these figures are of views that it learned from; those of "
-    "others are lower. To see them, train with --eval, from stage 1 on."
+    "others are lower. To see those, hold some out from stage 1 on (in 3DGS: --eval)."
 )
 
 

@@ -110,11 +110,14 @@ def _arguments(model: Path) -> Photographs | None:
 
 
 def told_by(values: Mapping[str, Any]) -> Photographs:
-    """The photographs that the arguments of a 3DGS host name, by their names there."""
-    source = Path(str(values["source_path"]))
+    """The photographs that the arguments of a 3DGS host name, by their names there.
+
+    A host without an argument for their size reads them as they are.
+    """
+    source, size = Path(str(values["source_path"])), values.get("resolution")
     return Photographs(
         source,
-        Resolution.asked(int(values.get("resolution", -1)), _DIVISORS),
+        Resolution() if size is None else Resolution.asked(int(size), _DIVISORS),
         bool(values.get("white_background", False)),
         str(values.get("images", "images")),
         centred=True,
