@@ -89,9 +89,9 @@ def write_page(out: Path, engine: EngineOptions) -> list[str]:
     """Write the report of ``out``, with pictures beside it; returns the files, relative to it."""
     pictures = writable_folder(out / PICTURES)
     given = out, pictures, out / "scene", engine
-    values, drawn, _ = results(*given, enlarge=LARGER, first=_FIRST)
-    if drawn is not None:
-        save_banner(pictures / BANNER, pictures, drawn)
+    values, _ = results(*given, enlarge=LARGER, first=_FIRST)
+    if values["views"]:
+        save_banner(pictures / BANNER, pictures, values["views"][0])
     values |= {"title": _TITLE, "shown_by": f"fragprune view {wording.quoted(out)}"}
-    save(out / PAGE, drawn, _TEMPLATE, (PICTURES + "/").__add__, **values)
+    save(out / PAGE, _TEMPLATE, (PICTURES + "/").__add__, values)
     return [*(f"{PICTURES}/{each.name}" for each in sorted(pictures.iterdir())), PAGE]

@@ -16,7 +16,7 @@ from torch import Tensor
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.files.atomic import replacing
 from fragprune_plugins.learning.stage2 import evenly_spaced
-from fragprune_plugins.workbench.figures import evaluate, page, pictures, wording
+from fragprune_plugins.workbench.figures import evaluate, page, pictures
 from fragprune_plugins.workbench.scenes.dataset import Shot
 
 TEMPLATE = Path(__file__).with_name("report.html")
@@ -52,15 +52,15 @@ class Drawn:
 
 
 def save(
-    target: Path, drawn: Drawn | None, template: Path, source: Callable[[str], str], **values: Any
+    path: Path, template: Path, source: Callable[[str], str], values: Mapping[str, Any]
 ) -> None:
     """Write a page of results by ``TEMPLATE`` or one that extends it, which gets the values.
 
     ``source`` turns a picture's file name into its ``src``, a relative path or a data URL.
     """
-    values |= vars(drawn or Drawn()) | {"source": source, "names": NAMES}
-    with replacing(target) as path:
-        path.write_text(page.render(template, TEMPLATE.parent, **values), encoding="utf-8")
+    text = page.render(template, TEMPLATE.parent, source=source, names=NAMES, **values)
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def draw_views(
@@ -104,9 +104,8 @@ def draw_views(
     return Drawn(views, target, limits["fragments"], limits["error"])
 
 
-def save_banner(path: Path, folder: Path, drawn: Drawn) -> None:
-    """Write the first view and its fragments, left of a line the original, right the pruned."""
-    view = drawn.views[0]
+def save_banner(path: Path, folder: Path, view: Shown) -> None:
+    """Write a view and its fragments, left of a line the original, right the pruned."""
     first, second = view.fragments
     halves = []
     for kind, said in (("", NAMES), ("_fragments", (f"{first} fragments per pixel", second))):
@@ -134,12 +133,6 @@ def shared_limit(maps: Sequence[Tensor]) -> float:
     values = torch.cat([each.flatten() for each in maps]).float()
     at = min(len(values), int(0.995 * len(values)) + 1)
     return max(1.0, float(values.kthvalue(at).values))
-
-
-def figures(columns: Mapping[str, dict[str, Any]]) -> page.Table:
-    """A table of measurements by name of the model, with the change between the last two."""
-    head, *rows = wording.tabulate(columns)
-    return page.Table(head, rows, wording.measured_with(columns))
 
 
 def save_learning(

@@ -32,6 +32,7 @@ from fragprune_plugins.workbench.scenes.dataset import Dataset, load_photographs
 PAGE = "report.html"
 _PNG = b"\x89PNG\r\n\x1a\n"
 _PICTURE = UntrustedFile(RecordError, "no picture", "a PNG", "Remove it.", limit=64 * MEBIBYTE)
+_LEARNED = ("run", "finetune")  # commands that learn
 _HOW = "Name the scene with --data: then it is read, and so are the models of the record."
 
 _ONLY_CONTROLS = (
@@ -45,9 +46,9 @@ def report(*, folder: Path, out: Path | None, data: Path | None, engine: EngineO
     target = out or folder / PAGE
     with TemporaryDirectory() as name:
         pictures = Path(name)
-        values, drawn, summary = results(folder, pictures, data, engine)
+        values, summary = results(folder, pictures, data, engine)
         how = report_page.TEMPLATE, lambda each: embedded(pictures / each)
-        report_page.save(target, drawn, *how, **values)
+        report_page.save(target, *how, values)
     lines = [summary["result"], *summary["notes"], f"Wrote {target}."]
     return Report({"page": str(target)} | summary, "\n".join(lines))
 
@@ -60,7 +61,7 @@ def results(
     *,
     enlarge: int = 1,
     first: str = "",
-) -> tuple[dict[str, Any], Drawn | None, dict[str, Any]]:
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """What a page says of the results in a folder, with its pictures in another.
 
     Args:
@@ -69,66 +70,70 @@ def results(
         first: the name of the view to begin with.
 
     Returns:
-        Values for the page's template, the views, and what ``--json`` says.
+        Values for the page's template, and what ``--json`` says.
     """
     every = records.find(folder)
-    for record in every:
-        _check(record)
-    results = [record for record in every if record.command in ("run", "finetune")]
+    files = [record.path for record in every]
+    told = {record.path: _told(record, files) for record in every}
+    results = [record for record in every if record.command in _LEARNED]
     pruned = [record for record in results if _goal(record) not in (None, CONTROL)]
     main = [*every, *results, *pruned][-1]
-    control = _goal(main) == CONTROL
-    files = [record.path for record in every]
-    line = _sentence(main, files)
-    facts, begun = _measured(main, files)
-    how = partial(open_engine, engine), enlarge, first
-    drawn, learning, missing = _draw(main, folder, pictures, data, *how)
+    control, of_main = _goal(main) == CONTROL, told.pop(main.path)
+    drawn, learning, missing = _draw(
+        main, folder, pictures, data, partial(open_engine, engine), enlarge, first
+    )
     more = [*learning, *_files(every, folder, pictures)]
-    notes = [*begun, *map(_outdated, every), _ONLY_CONTROLS if control else "", missing]
+    outdated = map(_outdated, every)
+    notes = [*of_main["notes"], *outdated, _ONLY_CONTROLS if control else "", missing]
     notes = [note for note in notes if note]
     values = {
-        "title": f"{_heading(main)} of {_of(main, folder)}",
-        "facts": facts,
-        "quote": line,
+        **vars(drawn),
+        **of_main,
+        "title": f"{of_main['heading']} of {_of(main, folder)}",
         "seen": bool(main.data.get("seen")),
         "labels": ("original", "control") if control else report_page.NAMES,
         "notes": records.portable(notes, folder),
-        "table": _table(main),
         "plots": more,
-        "others": [
-            {"heading": _heading(one), "sentence": _sentence(one, files), "table": _table(one)}
-            for one in every
-            if one is not main
-        ],
-        "settings": Table(["", ""], _settings(main), words=2),
+        "others": [*told.values()],
     }
-    return (
-        values,
-        drawn,
-        {
-            "result": line,
-            "command": main.command,
-            "control": control,
-            "record": str(main.path),
-            "views": [view.name for view in drawn.views] if drawn else [],
-            "pictures": (len(drawn.files) if drawn else 0) + len(more),
-            **{key: main.data.get(key) for key in ("before", "after", "adapter", "iterations")},
-            "notes": notes,
-        },
-    )
+    summary = {
+        "result": of_main["sentence"],
+        "command": main.command,
+        "control": control,
+        "record": str(main.path),
+        "views": [view.name for view in drawn.views],
+        "pictures": len(drawn.files) + len(more),
+        **{key: main.data.get(key) for key in ("before", "after", "adapter", "iterations")},
+        "notes": notes,
+    }
+    return values, summary
 
 
-def _check(record: Record) -> None:
-    """Raise RecordError if a record lacks what the page shows, or has it in other types."""
+def _told(record: Record, among: Sequence[Path]) -> dict[str, Any]:
+    """What the page says of a record; RecordError if it lacks some of it or has other types.
+
+    ``among`` are the files that may record its control. Of a fine-tuning that was measured before
+    and after, "facts" are its three figures, and "notes" lines on what came before it.
+    """
     with RECORD_FILE.stated(record.path):
+        data, columns = record.data, _columns(record)
         if (goal := _goal(record)) is not None:
             parse_goal(goal)
-        _table(record)
-        _sentence(record, [])
-        _settings(record)
-        _measured(record, [])
-        for name in record.data.get("files", ()):
+        for name in data.get("files", ()):
             Path(name)
+        control, facts, notes = None, [], []
+        if record.command in _LEARNED and len(columns) > 1:
+            control = data.get("control") or records.control_of(data, among)
+            facts, notes = wording.headlines(data, control), wording.begun(data)
+            notes += [wording.bounded(data)] if data.get("max_drop") else []
+        return {
+            "heading": _heading(record),
+            "sentence": _sentence(record, columns, control),
+            "table": _table(record, columns),
+            "facts": facts,
+            "notes": notes,
+            "settings": Table(["", ""], _settings(record), words=2),
+        }
 
 
 def _columns(record: Record) -> dict[str, dict[str, Any]]:
@@ -141,34 +146,35 @@ def _columns(record: Record) -> dict[str, dict[str, Any]]:
     return wording.columns_of(data)
 
 
-def _table(record: Record) -> Table:
+def _table(record: Record, columns: dict[str, dict[str, Any]]) -> Table:
     """A table of the measurements, else of the figures on training views."""
-    columns = _columns(record)
     if columns:
-        return report_page.figures(columns)
+        head, *rows = wording.tabulate(columns)
+        return Table(head, rows, wording.measured_with(columns))
     seen = record.data["training_views"]
     drawn = [seen[f"fragments_per_pixel_{when}"] for when in ("before", "after")]
     cells = ["unknown" if each is None else f"{each:.2f}" for each in drawn]
     return Table(["on training views", "before", "after"], [["fragments per pixel", *cells]])
 
 
-def _sentence(record: Record, among: Sequence[Path]) -> str:
-    """The outcome as a sentence to quote; ``among`` are the files that may record its control."""
-    data, columns = record.data, list(_columns(record).values())
+def _sentence(
+    record: Record, columns: dict[str, dict[str, Any]], control: dict[str, Any] | None
+) -> str:
+    """The outcome as a sentence to quote."""
+    data, measured = record.data, list(columns.values())
     name = data.get("adapter") or ""
     of = f"{name}, {data['iterations']:,} iterations: " if name else ""
-    if len(columns) > 1 and record.command in ("run", "finetune"):
-        control = data.get("control") or records.control_of(data, among)
+    if len(measured) > 1 and record.command in _LEARNED:
         return of + wording.outcome(record.command, data, control)
     if record.command == "compare":
         of = f"A is {data['a']['model']}, B is {data['b']['model']}: "
-    elif len(columns) > 1:  # of a profile
-        without, drawn = _columns(record)
+    elif len(measured) > 1:  # of a profile
+        without, drawn = columns
         of = f"{data['model']} {drawn}, against itself {without}: "
-    if len(columns) > 1:
-        return f"{of}{wording.gain(columns[0], columns[-1], data.get('enlarge', 1))}."
-    if columns:
-        drawn, frame = columns[0]["fragments_per_pixel"], columns[0]["frame_ms"]
+    if len(measured) > 1:
+        return f"{of}{wording.gain(measured[0], measured[-1], data.get('enlarge', 1))}."
+    if measured:
+        drawn, frame = measured[0]["fragments_per_pixel"], measured[0]["frame_ms"]
         return f"{drawn:.1f} fragments per pixel drawn, frames of {frame:.2f} ms."
     seen = data["training_views"]
     if not (seen["fragments_per_pixel_before"] and seen["fragments_per_pixel_after"]):
@@ -192,17 +198,6 @@ def _of(record: Record, folder: Path) -> str:
     """The name of what was pruned: a model's file, or the folder of a training."""
     name = Path(str(record.data.get("model", ""))).name if record.command == "finetune" else ""
     return name or folder.resolve().name
-
-
-def _measured(record: Record, among: Sequence[Path]) -> tuple[list[tuple[str, str]], list[str]]:
-    """Of a fine-tuning that was measured before and after: its three figures, and lines on what
-    came before it and what a bound found. Of others none.
-    """
-    data = record.data
-    if not (record.command in ("run", "finetune") and data.get("before") and data.get("after")):
-        return [], []
-    facts = wording.headlines(data, data.get("control") or records.control_of(data, among))
-    return facts, wording.begun(data) + ([wording.bounded(data)] if data.get("max_drop") else [])
 
 
 def _settings(record: Record) -> list[list[str]]:
@@ -255,7 +250,7 @@ def _draw(
     opened: Callable[[], tuple[Engine, torch.device]],
     enlarge: int,
     first: str,
-) -> tuple[Drawn | None, list[tuple[str, str]], str]:
+) -> tuple[Drawn, list[tuple[str, str]], str]:
     """Draw held-out views and learning curves into a folder; with an engine only if there are any.
 
     Files ``inside`` may be read without ``data``, which the user named. Returns the views,
@@ -263,7 +258,7 @@ def _draw(
     """
     source, curves = _source(record, data), record.data.get("curves")
     if source is None:
-        return None, [], ""
+        return Drawn(), [], ""
     allowed = [each for each in source.models if data is not None or lies_in(each, inside)]
     learning: list[tuple[str, str]] = []
     try:
@@ -276,18 +271,18 @@ def _draw(
                 report_page.save_learning(folder / report_page.LEARNING, curves, values)
             learning = [("How it learned", report_page.LEARNING)]
         if len(source.models) == 1:  # of joint learning, which leaves no model of before
-            return None, learning, ""
+            return Drawn(), learning, ""
         here = len(allowed) == 2 and all(lies_in(each, inside) for each in source.needs)
         if data is None and not here:
             missing = f"No views are shown: they need files outside of the folder. {_HOW}"
-            return None, learning, missing
+            return Drawn(), learning, missing
         dataset = source.dataset(loaded[0], engine)
     except (DatasetError, ModelFileError, SidecarError) as error:
         if data is not None:  # the user asked for the views
             raise
-        return None, learning, f"No views are shown: {error}"
+        return Drawn(), learning, f"No views are shown: {error}"
     if _outdated(record):
-        return None, learning, f"No views are shown: {source.models[-1].name} was changed since."
+        return Drawn(), learning, f"No views are shown: {source.models[-1].name} was changed since."
     before, after = (Candidate(each, source.drawing) for each in loaded)
     shots = sorted(dataset.test, key=lambda shot: shot.name != first)
     return report_page.draw_views(folder, before, after, shots, engine, enlarge), learning, ""

@@ -133,7 +133,7 @@ def _views(file: Path) -> None:
 def _record(file: Path) -> None:
     file.rename(file.with_name("a.fragprune.json"))
     for each in records.find(file.parent):
-        report._check(each)
+        report._told(each, [])
         recorded(each)
         records.control_of(each.data, [each.path])
 
