@@ -6,6 +6,7 @@ itself, ``SliceKernels``. Between the two passes only the inputs are kept.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any, Literal
@@ -52,11 +53,11 @@ def slice_at(splats: SpacetimeSplats, moment: Moment, *, engine: str | Engine = 
     if not isinstance(engine, CpuEngine | CudaEngine | ReferenceEngine):
         engine = create_engine(engine if isinstance(engine, str) else "auto", splats.device)
     if isinstance(engine, CpuEngine):
-        return slice_by(CpuKernels(engine.library, engine.workspace), splats, moment)
+        return slice_by(of_cpu(engine), splats, moment)
     if isinstance(engine, CudaEngine):
         engine.expect_on_device(splats.device)
         expect_right(engine.device, splats.device)
-        return slice_by(CudaKernels(engine.device, splats.device), splats, moment)
+        return slice_by(of_cuda(engine.device, splats.device), splats, moment)
     return slice_by_oracle(splats, moment)
 
 
@@ -87,48 +88,37 @@ Way = Literal["slice", "unslice"]
 
 
 @dataclass(frozen=True)
-class CpuKernels:
+class SliceKernels:
+    """The compiled functions that cut Gaussians."""
+
+    where: torch.device  # of the tensors
+    empty: Callable[..., Tensor]  # makes an uninitialised float32 tensor there, of a shape
+    call: Callable[..., None]  # cuts or goes back: ``Way``, inputs, what was cut, gradients to fill
+
+
+def of_cpu(engine: CpuEngine) -> SliceKernels:
     """fragprune_slice and fragprune_unslice of the compiled library."""
-
-    library: binding.Library
-    workspace: binding.Workspace
-    where = torch.device("cpu")
-
-    def empty(self, *shape: int) -> Tensor:
-        """An uninitialised float32 tensor of this shape."""
-        return empty(self.workspace, *shape)
-
-    def call(self, way: Way, *arguments: Any) -> None:
-        """Cut, or go back: inputs, what was cut or its gradients, and gradients to fill."""
-        run(self.library, way, *arguments)
+    made = partial(empty, engine.workspace)
+    return SliceKernels(torch.device("cpu"), made, partial(run, engine.library))
 
 
-@dataclass(frozen=True)
-class CudaKernels:
+def of_cuda(device: Device, where: torch.device) -> SliceKernels:
     """fp_slice and fp_unslice of native/cuda/slice.cu."""
 
-    device: Device
-    where: torch.device
+    def call(way: Way, given: structs.Spacetime, *others: Any) -> None:
+        passed, blocks = structs.Slicing(given, *others), blocks_of(given.count)
+        launch(device, where, "slice", structs.MACROS, f"fp_{way}", blocks, passed)
 
-    def empty(self, *shape: int) -> Tensor:
-        """An uninitialised float32 tensor of this shape on the device."""
-        return torch.empty(shape, dtype=torch.float32, device=self.where)
+    def made(*shape: int) -> Tensor:
+        return torch.empty(shape, dtype=torch.float32, device=where)
 
-    def call(self, way: Way, given: structs.Spacetime, *others: Any) -> None:
-        """Cut, or go back."""
-        passed = structs.Slicing(given, *others)
-        blocks = blocks_of(given.count)
-        launch(self.device, self.where, "slice", structs.MACROS, f"fp_{way}", blocks, passed)
-
-
-SliceKernels = CpuKernels | CudaKernels
-"""The compiled functions that cut Gaussians, and the device where tensors must be."""
+    return SliceKernels(where, made, call)
 
 
 @cache
 def expect_right(device: Device, where: torch.device) -> None:
     """Cut a few Gaussians on a GPU, once for each, and compare with the oracle."""
-    cut_there = partial(slice_by, CudaKernels(device, where))
+    cut_there = partial(slice_by, of_cuda(device, where))
     # The host's first cut may come where it wants no gradients, or has new tensors elsewhere.
     with torch.inference_mode(False), torch.device("cpu"):
         cut = _some(cut_there, where, torch.float32)
