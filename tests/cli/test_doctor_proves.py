@@ -23,7 +23,7 @@ EMULATION = {"compiler": "g++", "not_proved": None, "differences": [], "scenes":
 @pytest.fixture(autouse=True)
 def _small(monkeypatch):
     monkeypatch.setattr(prove, "SCENES", {"cpu": ((300, (48, 32)),)})
-    monkeypatch.setattr(prove, "_emulation", lambda say: EMULATION)  # gpu/test_proof.py has it
+    monkeypatch.setattr(prove, "_emulation", lambda: EMULATION)  # gpu/test_proof.py has it
 
 
 class Wrong(CpuEngine):
@@ -72,7 +72,7 @@ def test_every_engine_here_agrees_and_is_timed():
 def test_who_draws_otherwise_is_named_and_not_timed(monkeypatch, change):
     engines = {"wrong": Wrong(CHANGES[change]), "right": CpuEngine()}
     monkeypatch.setattr(prove, "_ours", lambda kind: engines)
-    report = prove.prove(lambda text: None, repeats=2)
+    report = prove.prove(repeats=2)
     assert report.exit_code == 1
     assert [bool(check["differences"]) for check in report.data["checks"]] == [True, False]
     assert {row["engine"] for row in report.data["times"]} == {"right"}
@@ -83,7 +83,7 @@ def test_what_nobody_held_is_said_and_is_no_success(monkeypatch):
     monkeypatch.undo()
     monkeypatch.setattr(prove, "SCENES", {"cpu": ()})
     monkeypatch.setattr(prove, "find_compiler", lambda: None)
-    report = prove.prove(lambda text: None)
+    report = prove.prove()
     assert report.exit_code == 1
     assert report.data["emulation"]["not_proved"]
     assert "cuda kernels, emulated: NOT PROVED, no C++17 compiler" in report.text
@@ -93,7 +93,7 @@ def test_without_an_engine_of_ours_nothing_is_proved(monkeypatch):
     monkeypatch.setattr(binding, "usable_builds", list)
     monkeypatch.setattr(binding, "available", lambda: False)
     monkeypatch.setattr(binding, "chosen", lambda: "not built")
-    report = prove.prove(lambda text: None)
+    report = prove.prove()
     assert report.exit_code == 1
     assert "cpu: left out, not built" in report.text
 
@@ -120,7 +120,7 @@ def host(monkeypatch):
 def test_a_hosts_own_rasterizer_that_agrees_is_timed_in_turns(host):
     engines = {"ours": CpuEngine(), "host": peers.peer(PACKAGE)}
     assert prove._check("host", engines["host"], "cpu")["differences"] == []
-    rows = list(prove._times(engines, "cpu", 2, lambda text: None))
+    rows = list(prove._times(engines, "cpu", 2))
     assert [row["engine"] for row in rows if row["round"] == "peers"] == ["ours", "host"] * 2
     assert all(isnan(row["fragments_per_pixel"]) for row in rows if row["engine"] == "host")
     assert all(row["difference"] < 1e-6 for row in rows if row["round"] == "peers")

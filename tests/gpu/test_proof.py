@@ -27,7 +27,7 @@ def proof(device: EmulatedDevice, monkeypatch: pytest.MonkeyPatch) -> Report:
     monkeypatch.setattr(prove, "EmulatedDevice", lambda compiler, folder: device)
     monkeypatch.setattr(prove, "SCENES", {"cpu": ((300, (48, 32)),)})
     monkeypatch.setattr(prove, "_ours", lambda kind: {"right": CpuEngine()})
-    return prove.prove(lambda text: None, repeats=2)
+    return prove.prove(repeats=2)
 
 
 def test_kernels_that_agree_are_proved_and_not_timed(device, monkeypatch):

@@ -11,10 +11,10 @@ import datetime
 import hashlib
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -52,9 +52,8 @@ _NOT_EMULATED = "no C++17 compiler on Linux: install g++, or name one with CXX, 
 _CLOCKS = ("driver_version", "clocks.sm", "clocks.max.sm", "clocks.mem", "temperature.gpu")
 
 
-def prove(say: Callable[[str], None] | None = None, repeats: int = 9) -> Report:
-    """Check, then time ``repeats`` frames of each row; ``say``, else stderr, is told how far."""
-    say = say or partial(click.echo, err=True)
+def prove(repeats: int = 9) -> Report:
+    """Check, then time ``repeats`` frames of each row; stderr is told how far."""
     kind = "cuda" if torch.cuda.is_available() else "cpu"
     engines, left_out = _ours(kind), {}
     for name in peers.installed():
@@ -66,11 +65,8 @@ def prove(say: Callable[[str], None] | None = None, repeats: int = 9) -> Report:
         left_out["cuda"] = missing
     if not binding.available():
         left_out["cpu"] = str(binding.chosen())
-    checks = []
-    for name, engine in engines.items():
-        say(f"checking {name}")
-        checks.append(_check(name, engine, kind))
-    emulation = _emulation(say)
+    checks = [_check(name, engine, kind) for name, engine in engines.items()]
+    emulation = _emulation()
     passed = {c["name"]: engines[c["name"]] for c in checks if not c["differences"]}
     data: dict[str, Any] = {
         "format": FORMAT,
@@ -83,10 +79,14 @@ def prove(say: Callable[[str], None] | None = None, repeats: int = 9) -> Report:
         "left_out": left_out,
         "checks": checks,
         "emulation": emulation,
-        "times": list(_times(passed, kind, repeats, say)),
+        "times": list(_times(passed, kind, repeats)),
     }
     data["machine"]["load_after"] = timing.load_average()
     return Report(data, _text(data), exit_code=0 if _proved(data) else 1)
+
+
+def _say(text: str) -> None:
+    click.echo(text, err=True)
 
 
 def _proved(data: dict[str, Any]) -> bool:
@@ -108,41 +108,41 @@ def _ours(kind: str) -> dict[str, Engine]:
 
 def _check(name: str, engine: Engine, kind: str) -> dict[str, Any]:
     """Every difference from the oracle in float64; empty if there is none."""
+    _say(f"checking {name}")
     where = "cpu" if isinstance(engine, CpuEngine) else kind
-    found: dict[str, Any] = {"name": name, "ours": not isinstance(engine, Peer)}
     if isinstance(engine, Peer):
-        return found | {"differences": list(peer_differences(engine, where))}
-    rows = [held(engine, where, scene) for scene in scenes()]
-    differences = [each for row in rows for each in row["differences"]]
-    return found | {"differences": differences, "scenes": rows}
+        return {"name": name, "ours": False, "differences": list(peer_differences(engine, where))}
+    return {"name": name, "ours": True} | _held([held(engine, where, each) for each in scenes()])
 
 
-def _emulation(say: Callable[[str], None]) -> dict[str, Any]:
+def _held(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Rows of ``held``, and all that is wrong in them."""
+    return {"differences": [each for row in rows for each in row["differences"]], "scenes": rows}
+
+
+def _emulation() -> dict[str, Any]:
     """The kernels' own text, run on the CPU; a frame draws as on a GPU, and takes no such time."""
     compiler = find_compiler()
     if compiler is None:
-        return {"compiler": None, "not_proved": _NOT_EMULATED, "differences": [], "scenes": []}
+        return {"compiler": None, "not_proved": _NOT_EMULATED} | _held([])
     with tempfile.TemporaryDirectory(prefix="fragprune-") as folder:
         device = EmulatedDevice(compiler, Path(folder))
         engine = CudaEngine(device, deterministic=False)
         engine.capacity = 1 << 13  # each entry that there is room for costs time
         rows = []
         for scene in scenes():
-            say(f"emulating the cuda kernels: {scene.scene}")
+            _say(f"emulating the cuda kernels: {scene.scene}")
             rows.append(held(engine, "cpu", scene))
-        differences = [each for row in rows for each in row["differences"]]
-        say("emulating the cuda kernels: a cut in time")
+        found = _held(rows)
+        _say("emulating the cuda kernels: a cut in time")
         try:
             expect_right(device, torch.device("cpu"))
         except (FragpruneError, RuntimeError) as error:
-            differences.append(f"a cut in time: {str(error).splitlines()[0]}")
-    proved = {"compiler": version_of(compiler), "not_proved": None}
-    return proved | {"differences": differences, "scenes": rows}
+            found["differences"].append(f"a cut in time: {str(error).splitlines()[0]}")
+    return {"compiler": version_of(compiler), "not_proved": None} | found
 
 
-def _times(
-    engines: Mapping[str, Engine], kind: str, repeats: int, say: Callable[[str], None]
-) -> Iterator[dict[str, Any]]:
+def _times(engines: Mapping[str, Engine], kind: str, repeats: int) -> Iterator[dict[str, Any]]:
     """Rows of all that passed and draw on the device, timed in turns."""
     timed = {k: e for k, e in engines.items() if kind == "cpu" or not isinstance(e, CpuEngine)}
     ours = {name: each for name, each in timed.items() if not isinstance(each, Peer)}
@@ -154,7 +154,7 @@ def _times(
         for what, some, turns in rounds:
             if not turns:
                 continue
-            say(f"timing {what}: {count:,} Gaussians at {size[0]}x{size[1]}")
+            _say(f"timing {what}: {count:,} Gaussians at {size[0]}x{size[1]}")
             rows = timing.measure(some, [*turns.values()], repeats=repeats)
             for name, row in zip([*turns] * len(some), rows, strict=True):
                 yield {"round": what} | row | {"engine": name}
