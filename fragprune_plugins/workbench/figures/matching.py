@@ -37,7 +37,8 @@ def matched(model: Model, read: Photographs, engine: Engine) -> tuple[Photograph
     ways = {way: dataset.read_as(*way).to(model.device) for way in product(points, alphas)}
     if len(ways) == 1:
         return read, ways[told]
-    figures = {way: shown(model, each, engine) for way, each in ways.items()}
+    some = {way: evenly_spaced(each.train, 8) for way, each in ways.items()}
+    figures = {way: mean(psnrs(Candidate(model), each, engine)[0]) for way, each in some.items()}
     best, *others = sorted(figures, key=figures.__getitem__, reverse=True)
     unknown = len(points) > 1 and read.centred is None
     if unknown or best != told:
@@ -54,11 +55,6 @@ def told_or_matched(model: Model, read: Photographs, engine: Engine) -> tuple[Ph
     if read.centred is None:
         return matched(model, read, engine)
     return read, load_photographs(read).to(model.device)
-
-
-def shown(model: Model, dataset: Dataset, engine: Engine) -> float:
-    """How well a model shows up to eight training pictures, dB of PSNR."""
-    return mean(psnrs(Candidate(model), evenly_spaced(dataset.train, 8), engine)[0])
 
 
 def shown_and_plain(model: Model, dataset: Dataset, engine: Engine) -> tuple[float, float]:
