@@ -55,11 +55,8 @@ class SpacetimeSplats:
         n = len(self.means)
         check_fields(self, opacities=(n,), times=(n,), scales=(n, 3), scales_t=(n,))
         check_fields(self, rotations=(n, 4), rotations_r=(n, 4), cov3d=(n, 6), sh=(n, None, 3))
-        given = tuple(
-            getattr(self, name) is not None
-            for name in ("cov3d", "scales", "rotations", "scales_t", "rotations_r")
-        )
-        if given not in _SPACETIME_KINDS or (self.scales_t is not None and self.times is None):
+        given = {name for name in set().union(*_KINDS) if getattr(self, name) is not None}
+        if given not in _KINDS or ("scales_t" in given and self.times is None):
             found = "cov3d, scales, rotations and times as given"
             expected = "cov3d alone, or scales and rotations, with scales_t and times, "
             expected += "with rotations_r"
@@ -75,11 +72,11 @@ class SpacetimeSplats:
         return self.means.device
 
 
-_SPACETIME_KINDS = (
-    (True, False, False, False, False),
-    (False, True, True, False, False),
-    (False, True, True, True, False),
-    (False, True, True, True, True),
+_KINDS: Final = (
+    {"cov3d"},
+    {"scales", "rotations"},
+    {"scales", "rotations", "scales_t"},
+    {"scales", "rotations", "scales_t", "rotations_r"},
 )
 
 

@@ -10,8 +10,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import torch
-
 from fragprune_plugins.engines import Engine
 from fragprune_plugins.errors import DatasetError, ModelFileError, RecordError, SidecarError
 from fragprune_plugins.files.model import Model
@@ -79,9 +77,7 @@ def results(
     pruned = [record for record in results if _goal(record) not in (None, CONTROL)]
     main = [*every, *results, *pruned][-1]
     control, of_main = _goal(main) == CONTROL, told.pop(main.path)
-    drawn, learning, missing = _draw(
-        main, folder, pictures, data, partial(open_engine, engine), enlarge, first
-    )
+    drawn, learning, missing = _draw(main, folder, pictures, data, engine, enlarge, first)
     more = [*learning, *_files(every, folder, pictures)]
     outdated = map(_outdated, every)
     notes = [*of_main["notes"], *outdated, _ONLY_CONTROLS if control else "", missing]
@@ -247,7 +243,7 @@ def _draw(
     inside: Path,
     folder: Path,
     data: Path | None,
-    opened: Callable[[], tuple[Engine, torch.device]],
+    options: EngineOptions,
     enlarge: int,
     first: str,
 ) -> tuple[Drawn, list[tuple[str, str]], str]:
@@ -262,7 +258,7 @@ def _draw(
     allowed = [each for each in source.models if data is not None or lies_in(each, inside)]
     learning: list[tuple[str, str]] = []
     try:
-        engine, device = opened()
+        engine, device = open_engine(options)
         loaded = [load(path, filtered=source.filtered, device=device) for path in allowed]
         if curves:
             values = loaded[-1].falloff if source.models[-1] in allowed else None
