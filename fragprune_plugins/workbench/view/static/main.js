@@ -129,13 +129,9 @@ class Viewer {
         const camera = this.framed(quality);
         const counted = this.map !== "picture";
         this.drawing.draw(camera, this.sides(camera.width), { counted });
-        this.present();
-    }
-
-    present() {
         this.drawing.show({
             background: this.background,
-            limit: this.map === "picture" ? 0 : this.limit,
+            limit: counted ? this.limit : 0,
             channel: this.map === "fragments" ? 1 : 0,
         });
     }
@@ -474,7 +470,6 @@ function wire(viewer) {
         if (viewer.keys.size === 1 && viewer.keys.has("shift")) viewer.keys.clear();
     });
     addEventListener("blur", () => viewer.keys.clear());
-    viewer.pick = pick;
 }
 
 // Two layers: their names, and which of them to show.
@@ -505,14 +500,13 @@ async function start() {
     $("#title").textContent = document.title = scene.title;
     $("#loading span").textContent = "Loading";
     const bar = $("#loading progress");
-    const loaded = new Map();
     wire(viewer);
     for (const [number, facts] of scene.models.entries()) {
         const held = await asset(facts.file, part => { bar.value = part; });
         const buffer = facts.bits === undefined ? held : await expanded(held, facts);
-        loaded.set(number, new Splats(viewer.drawing.gl, facts, buffer));
+        const splats = new Splats(viewer.drawing.gl, facts, buffer);
         const layers = scene.layers.filter(({ model }) => model === number);
-        viewer.addLayers(layers.map(({ truncated, name }) => ({ splats: loaded.get(number), truncated, name })));
+        viewer.addLayers(layers.map(({ truncated, name }) => ({ splats, truncated, name })));
         sides(viewer);
     }
     const counts = scene.models.map(({ gaussians }) => gaussians.toLocaleString("en"));
