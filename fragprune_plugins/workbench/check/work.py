@@ -255,13 +255,9 @@ class Verdict:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, for ``--json``."""
-        known: dict[str, Any] = {
-            "verdict": self.kind,
-            "sentence": self.sentence,
-            "reason": self.reason,
-        }
-        known |= {"nearest": self.adapter, "differs": list(self.differs)}
-        return known | {"inside": dict(self.inside)}
+        known = vars(self) | {"differs": list(self.differs), "inside": dict(self.inside)}
+        named = {"kind": "verdict", "adapter": "nearest"}
+        return {named.get(name, name): each for name, each in known.items()}
 
 
 def judge(

@@ -123,15 +123,10 @@ def package_version(package: str) -> str | None:
 def _cpu_engine() -> dict[str, Any]:
     """The build in use, or the reason why there is none."""
     answer = binding.chosen()
-    known = answer if isinstance(answer, binding.Library) else None
-    return {
-        "available": known is not None,
-        "build": known and known.build,
-        "lanes": known and known.lanes,
-        "path": known and known.path,
-        "usable": binding.usable_builds() if known else [],
-        "reason": None if known else answer,
-    }
+    known = isinstance(answer, binding.Library)
+    facts = {name: getattr(answer, name, None) for name in ("build", "lanes", "path")}
+    usable = binding.usable_builds() if known else []
+    return {"available": known, **facts, "usable": usable, "reason": None if known else answer}
 
 
 def _cuda_engine() -> dict[str, Any]:
