@@ -7,7 +7,7 @@ import pytest
 import scenes
 import torch
 from browser.chromium import opened, served
-from browser.viewing import decibels, engine_frame, frame, hold, viewing, write_page
+from browser.viewing import decibels, engine_frame, frame, hold, pixels, viewing, write_page
 from finetune import tiny
 
 from fragprune_plugins import Model, RasterInputs, ThresholdStore, View, load_dataset
@@ -159,10 +159,9 @@ def test_split_shows_each_side_as_it_is_alone(browser, tmp_path):
                 const [left, right] = viewer.layers;
                 const both = [{ ...left, sides: [0, 77] }, { ...right, sides: [77, 200] }];
                 viewer.drawing.draw(held, both);
-                viewer.drawing.show({ background: [0.1, 0.3, 0.2] });
             }"""
         )
-        both = tab.array("viewer.drawing.pixels()").reshape(HEIGHT, WIDTH, 4)[..., :3] / 255
+        both = pixels(tab, [0.1, 0.3, 0.2], WIDTH)
         np.testing.assert_allclose(both[:, :77], left[:, :77], atol=1.01 / 255)
         np.testing.assert_allclose(both[:, 77:], right[:, 77:], atol=1.01 / 255)
         assert np.abs(left - right).mean() > 0.01

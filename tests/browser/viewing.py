@@ -54,19 +54,35 @@ def hold(tab: Tab, view: View) -> None:
 
 def frame(tab: Tab, view: View, layer: int = 0, *, stop: bool = True) -> Frame:
     """Draw a layer with counts from a camera, after ``hold``."""
-    width, height = view.width, view.height
-    background = view.background.tolist()
+    width = view.width
     tab.run(
         f"""() => {{
             viewer.drawing.options.stop = {json.dumps(stop)};
             const layer = {{ ...viewer.layers[{layer}], sides: [0, {width}] }};
             viewer.drawing.draw(held, [layer], {{ counted: true }});
-            viewer.drawing.show({{ background: {background} }});
         }}"""
     )
-    image = tab.array("viewer.drawing.pixels()").reshape(height, width, 4)[..., :3] / 255
-    counts = tab.array("viewer.drawing.allCounts()").reshape(height, width, 2)
-    return Frame(image, counts[..., 0], counts[..., 1])
+    counts = _read(tab, "viewer.drawing.countsAt(0, 0)", "Float32Array", "FLOAT", width)
+    return Frame(pixels(tab, view.background.tolist(), width), counts[..., 0], counts[..., 1])
+
+
+def pixels(tab: Tab, background: list[float], width: int) -> np.ndarray:
+    """What was drawn, over a background, rows from the top: (H, W, 3) RGB in [0, 1]."""
+    shown = f"viewer.drawing.show({{ background: {background} }})"
+    return _read(tab, shown, "Uint8Array", "UNSIGNED_BYTE", width)[..., :3] / 255
+
+
+def _read(tab: Tab, after: str, array: str, kind: str, width: int) -> np.ndarray:
+    """The framebuffer that an expression leaves bound, rows from the top: (H, W, 4)."""
+    found = tab.array(
+        f"""(() => {{
+            {after};
+            const {{ gl, width, height }} = viewer.drawing, found = new {array}(width * height * 4);
+            gl.readPixels(0, 0, width, height, gl.RGBA, gl.{kind}, found);
+            return found;
+        }})()"""
+    )
+    return found.reshape(-1, width, 4)[::-1]
 
 
 def engine_frame(model: Model, view: View, *, truncated: bool = True) -> np.ndarray:

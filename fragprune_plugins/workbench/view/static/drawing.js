@@ -60,9 +60,7 @@ export class Drawing {
     }
 
     // Put the picture, or counts as colours, on the canvas; or aside, where nobody sees it.
-    show(how = {}) {
-        this.shown = { ...how, aside: false };
-        const { background = [0, 0, 0], limit = 0, channel = 0, aside = false } = how;
+    show({ background = [0, 0, 0], limit = 0, channel = 0, aside = false } = {}) {
         const { gl } = this;
         const use = this.#use("show", WHOLE, SHOW);
         gl.bindFramebuffer(gl.FRAMEBUFFER, aside ? this.aside : null);
@@ -103,31 +101,6 @@ export class Drawing {
         gl.readBuffer(gl.COLOR_ATTACHMENT1);
         gl.readPixels(x, this.height - 1 - y, 1, 1, gl.RGBA, gl.FLOAT, found);
         return { quads: found[0], fragments: found[1] };
-    }
-
-    // All counts, row by row from the top: quads and fragments of each pixel.
-    allCounts() {
-        const { gl } = this, found = new Float32Array(this.width * this.height * 4);
-        gl.bindFramebuffer(gl.FRAMEBUFFER, this.countTarget);
-        gl.readBuffer(gl.COLOR_ATTACHMENT1);
-        gl.readPixels(0, 0, this.width, this.height, gl.RGBA, gl.FLOAT, found);
-        const counts = new Float32Array(this.width * this.height * 2);
-        for (let i = 0; i < this.width * this.height; i++) {
-            const x = i % this.width, y = this.height - 1 - Math.floor(i / this.width);
-            counts.set(found.subarray((y * this.width + x) * 4, (y * this.width + x) * 4 + 2), i * 2);
-        }
-        return counts;
-    }
-
-    // What the canvas was given last, row by row from the top: red, green, blue, alpha.
-    pixels() {
-        const { gl, width, height } = this, found = new Uint8Array(width * height * 4);
-        this.show(this.shown); // what a canvas shows is gone when the browser has taken it
-        gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, found);
-        const turned = new Uint8Array(found.length);
-        for (let y = 0; y < height; y++)
-            turned.set(found.subarray((height - 1 - y) * width * 4, (height - y) * width * 4), y * width * 4);
-        return turned;
     }
 
     // Wait until what was shown aside is there.
