@@ -21,7 +21,7 @@ export async function expanded(packed, { gaussians: count, degree, bits, rows })
     const inflated = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
     const inflating = new Response(inflated).arrayBuffer();
     const bytes = new Uint8Array(await inflating.catch(() => { throw new Error("The model in this page is damaged: make it again."); }));
-    const width = Math.ceil((3 * (degree + 1) ** 2) / 8) * 8, rest = 3 * (degree + 1) ** 2 - 3;
+    const coefficients = 3 * (degree + 1) ** 2, width = Math.ceil(coefficients / 8) * 8;
     const buffer = new ArrayBuffer(count * (32 + width * 2));
     const means = new Float32Array(buffer, 0, count * 8), words = new Uint16Array(buffer);
     let at = 0;
@@ -57,23 +57,19 @@ export async function expanded(packed, { gaussians: count, degree, bits, rows })
         words[i * 16 + 8 + largest] = Math.round(Math.sqrt(Math.max(0, left)) * 32767);
     }
 
-    // Columns of 16-bit words from one to another, in a table so wide.
-    const columns = (from, to, start, stride) => {
-        const meant = book();
+    // Columns of 16-bit words from one to another, in a table so wide; shared: of the different rows.
+    const columns = (from, to, start, stride, shared = false) => {
+        const meant = book(), row = shared && rows < count ? numbers() : i => i;
         for (let column = from; column < to; column++) {
-            const codes = plane();
-            for (let i = 0, place = start + column; i < count; i++, place += stride) words[place] = meant[codes[i]];
+            const codes = plane(shared ? rows : count);
+            for (let i = 0, place = start + column; i < count; i++, place += stride) words[place] = meant[codes[row(i)]];
         }
     };
     columns(6, 7, 0, 16);
     columns(7, 8, 0, 16);
     columns(12, 15, 0, 16);
     columns(0, 3, count * 16, width);
-    const meant = book(), row = rows < count ? numbers() : i => i;
-    for (let column = 0; column < rest; column++) {
-        const codes = plane(rows);
-        for (let i = 0, place = count * 16 + 3 + column; i < count; i++, place += width) words[place] = meant[codes[row(i)]];
-    }
+    columns(3, coefficients, count * 16, width, true);
     if (at !== bytes.length) throw new Error(`${bytes.length} bytes of a model where ${at} belong: make the page again.`);
     return buffer;
 }

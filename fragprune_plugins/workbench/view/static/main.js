@@ -105,14 +105,10 @@ class Viewer {
 
     get two() { return this.layers.length > 1; }
 
-    size(quality) {
-        const ratio = Math.min(window.devicePixelRatio || 1, 2) * quality;
-        return [innerWidth, innerHeight].map(each => Math.max(1, Math.round(each * ratio)));
-    }
-
     // The camera for the window: on a phone its picture lies above the panel.
     framed(quality) {
-        const [width, height] = this.size(quality);
+        const ratio = Math.min(window.devicePixelRatio || 1, 2) * quality;
+        const [width, height] = [innerWidth, innerHeight].map(each => Math.max(1, Math.round(each * ratio)));
         const below = innerWidth <= 640 ? $("#panel").offsetHeight / innerHeight : 0;
         return { ...fitted(this.camera, width, Math.round(height * (1 - below))), height };
     }
@@ -308,12 +304,7 @@ function choices(fieldset, options, chosen, pick) {
     }
 }
 
-function choose(name, value) {
-    const input = document.querySelector(`#${name} input[value="${value}"]`);
-    if (!input || input.checked) return;
-    input.checked = true;
-    input.dispatchEvent(new Event("change"));
-}
+const choose = (name, value) => $(`#${name} input[value="${value}"]`)?.click();
 
 function wire(viewer) {
     const { scene } = viewer;

@@ -67,13 +67,9 @@ export class Splats {
         if (this.order) upload(gl, this.order, order, gl.RED_INTEGER, 1);
         this.count = order.length;
         this.sorted = milliseconds;
-        this.inOrder = this.busy;
-        this.busy = null;
-        if (this.waiting) {
-            const next = this.waiting;
-            this.waiting = null;
-            this.sort(next);
-        }
+        const next = this.waiting;
+        [this.inOrder, this.busy, this.waiting] = [this.busy, null, null];
+        if (next) this.sort(next);
         this.onsorted();
     }
 }
