@@ -110,7 +110,8 @@ def compact(tables: bytes, facts: dict[str, Any]) -> tuple[bytes, dict[str, int]
     bits = _bits(means)
     fixed = np.rint(means * 2.0**bits)
     rotations, turned = _rotations(words[:, 8:12].view("<i2"))
-    parts = [_means(fixed.astype(np.int32)), rotations.T]
+    steps: Any = np.diff(fixed.astype(np.int32), axis=0, prepend=np.int32(0))
+    parts = [_planes(((steps << 1) ^ (steps >> 31)).T), rotations.T]
     changed = {"positions": bool((fixed != means * 2.0**bits).any()), "rotations": turned}
 
     low, high = facts["scales"]
@@ -150,12 +151,6 @@ def _bits(means: NDArray[np.float64]) -> int:
     if most * 2.0**bits >= _FARTHEST:
         raise OverflowError(f"a mean at {most:.6g}")
     return bits
-
-
-def _means(fixed: NDArray[np.int32]) -> Bytes:
-    """Planes of differences, those of x first."""
-    steps = np.diff(fixed, axis=0, prepend=np.int32(0))
-    return _planes(((steps << 1) ^ (steps >> 31)).T)
 
 
 def _planes(numbers: NDArray[Any]) -> Bytes:
