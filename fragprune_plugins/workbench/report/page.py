@@ -44,12 +44,6 @@ class Drawn:
     most_fragments: float = 1.0  # per pixel, at the top of the scale
     most_error: float = 1.0  # likewise, the difference to the photograph in 8-bit levels
 
-    @property
-    def files(self) -> list[str]:
-        """Names of all pictures."""
-        kinds = [f"{model}{kind}" for model in NAMES for kind in ("", "_fragments", "_error")]
-        return [f"{view.name}_{kind}.png" for view in self.views for kind in ("photograph", *kinds)]
-
 
 def save(
     path: Path, template: Path, source: Callable[[str], str], values: Mapping[str, Any]

@@ -78,7 +78,6 @@ def results(
     main = [*every, *results, *pruned][-1]
     control, of_main = _goal(main) == CONTROL, told.pop(main.path)
     drawn, learning, missing = _draw(main, folder, pictures, data, engine, enlarge, first)
-    more = [*learning, *_files(every, folder, pictures)]
     outdated = map(_outdated, every)
     notes = [*of_main["notes"], *outdated, _ONLY_CONTROLS if control else "", missing]
     notes = [note for note in notes if note]
@@ -89,7 +88,7 @@ def results(
         "seen": bool(main.data.get("seen")),
         "labels": ("original", "control") if control else report_page.NAMES,
         "notes": records.portable(notes, folder),
-        "plots": more,
+        "plots": [*learning, *_files(every, folder, pictures)],
         "others": [*told.values()],
     }
     summary = {
@@ -98,7 +97,7 @@ def results(
         "control": control,
         "record": str(main.path),
         "views": [view.name for view in drawn.views],
-        "pictures": len(drawn.files) + len(more),
+        "pictures": len([*pictures.iterdir()]),
         **{key: main.data.get(key) for key in ("before", "after", "adapter", "iterations")},
         "notes": notes,
     }
