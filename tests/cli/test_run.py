@@ -21,7 +21,7 @@ from fragprune_plugins.injection import launch
 from fragprune_plugins.learning.schedule import USUAL_STOP
 from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.figures.wording import begun
-from fragprune_plugins.workbench.finetune import trial
+from fragprune_plugins.workbench.finetune import relocation, trial
 from fragprune_plugins.workbench.finetune.loop import LIVELY
 from fragprune_plugins.workbench.finetune.relocation import PACE, SHARE, least
 from fragprune_plugins.workbench.pruning import kept
@@ -332,6 +332,16 @@ def test_stage_two_is_as_lively_as_a_fine_tuning(folder, monkeypatch, forgotten)
     assert any(each.startswith(f"Moved {len(rows)}") for each in begun(data))
     after = load(data["model_after"])
     assert len(after.thresholds) == len(after) == data["gaussians"]
+
+
+def test_area_has_a_price_while_gaussians_move(folder, monkeypatch):
+    monkeypatch.setattr(trial, "forgotten", lambda *_, **__: 0.0)
+    areas = []
+    for price in 0.0, 1.0:
+        monkeypatch.setattr(relocation, "COMPACT", price)
+        data, _ = rates_of(monkeypatch, "--again", *folder[1])
+        areas.append(data["after"]["area_per_pixel"])
+    assert areas[1] < 0.95 * areas[0]  # of ten of the 40 steps
 
 
 def test_a_host_with_two_optimizers_is_as_lively(folder, scene, host, monkeypatch):

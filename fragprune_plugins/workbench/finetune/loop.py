@@ -31,7 +31,7 @@ from fragprune_plugins.types import RasterInputs, RasterOutputs, one_line
 from fragprune_plugins.workbench.finetune.faster import FrameTarget, require_reach
 from fragprune_plugins.workbench.finetune.losses import code_for, photometric_loss
 from fragprune_plugins.workbench.finetune.processes import Processes, SharedStage
-from fragprune_plugins.workbench.finetune.relocation import COMPACT, Relocation, deepen
+from fragprune_plugins.workbench.finetune.relocation import Relocation, deepen, price
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints, configuration
 from fragprune_plugins.workbench.goals import Faster
 from fragprune_plugins.workbench.scenes.dataset import Dataset, Shot
@@ -46,7 +46,6 @@ LIVELY = 4.0
 docs/experiments/defaults.md. Its own pictures teach worse so: 29.75 dB in place of 29.89 on fox
 (--self --dropout 0.2)."""
 _POSTFIXES = 100  # times in a run that the bar says how it goes
-_LEAST_AREA = 1e-12  # per pixel: a view may show nothing, and has no gradient then
 
 _OF_VIEWS = {"before", "after"}  # of stage 2's tensors; all others have a row for each Gaussian
 _UNFIT = (  # raised where the parts of a checkpoint do not fit what they are loaded into
@@ -317,7 +316,7 @@ class Training:
             loss = photometric_loss(shot.looked_at(outputs.image), shot.image) / len(shots)
             stage.on_loss(loss)
             if area is not None:
-                loss = loss + COMPACT * loss.detach() * area.clamp(min=_LEAST_AREA).log()
+                loss = loss + price(loss, area)
             torch.autograd.backward(loss if pressure is None else loss + pressure)
         stage.picture = ", ".join(shot.name for shot in shots)
         due = self._checkpoints is not None and self._checkpoints.due(self.done + 1)

@@ -44,6 +44,7 @@ DEEPER = 1.6
 
 Moments = Mapping[Tensor, Mapping[str, Any]]
 
+_LEAST_AREA = 1e-12  # per pixel: a view may show nothing, and has no gradient then
 _LARGEST = 3.0  # medians, of the size that counts: skies take steps that change much of a picture
 _ROUNDS, _FIRST, _LAST = 10, 0.05, 0.3  # of the run: what moves later has not settled at its end
 _APART = 0.7  # twins' distance from the whole, over its longest axis: they are as long together
@@ -158,6 +159,11 @@ class Relocation:
         origins[leaving] = wholes
         store.rearrange(origins, fresh)
         self.pull.zero_()
+
+
+def price(loss: Tensor, area: Tensor) -> Tensor:
+    """What the ellipses' area per pixel (``area_per_pixel``) costs beside a loss, in its units."""
+    return COMPACT * loss.detach() * area.clamp(min=_LEAST_AREA).log()
 
 
 def deepen(pressure: PressureRule) -> None:

@@ -1,28 +1,32 @@
 """Stage 2 of a host, as lively as a fine-tuning: at its rates, and with Gaussians that move.
 
 A host's stage 2 takes its own steps. Those of a model whose PLY shows all that its host draws are
-larger here, as ``fragprune finetune`` has them, and Gaussians move between some of them.
+larger here, as ``fragprune finetune`` has them, and Gaussians move between some of them. Until all
+have moved, area has a price: that of training views in turn, beside the host's last loss.
 """
 
 from __future__ import annotations
 
 import contextlib
 import weakref
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from fragprune_plugins.injection.rasterizing import directly
 from fragprune_plugins.injection.session import active_session
 from fragprune_plugins.injection.state import SessionState
+from fragprune_plugins.learning.area import area_per_pixel
+from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.learning.stage2 import Stage2
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins.hookspecs import hookimpl
-from fragprune_plugins.types import one_line
+from fragprune_plugins.types import RasterInputs, Splats, View, one_line
 from fragprune_plugins.workbench.finetune.loop import LIVELY
-from fragprune_plugins.workbench.finetune.relocation import Relocation, deepen
+from fragprune_plugins.workbench.finetune.relocation import Relocation, deepen, price
 
 _NAMES = {"xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation"}
 _POSITIONS = 0.1  # of a host's first rate, at which those of a trained model still find better ones
@@ -36,11 +40,15 @@ class Lively:
     Attributes:
         on: whether stage 2 learns at the rates of a fine-tuning.
         rows: (M,) int64, the Gaussians that may move, see ``Relocation``; None for none.
+        views: of the training, on the model's device, to price area in; empty for no price.
+        loss: () the host's, of the step before; None before the first.
         relocated: Gaussians that have moved.
     """
 
     on: bool = False
     rows: Tensor | None = None
+    views: Sequence[View] = ()
+    loss: Tensor | None = None
     relocated: int = 0
 
     __repr__ = one_line
@@ -57,6 +65,11 @@ class Lively:
             for optimizer in filter(None, (known() for known in session.optimizers[model])):
                 state.hooks.append(optimizer.register_step_pre_hook(lively.before))
                 state.hooks.append(optimizer.register_step_post_hook(lively.after))
+
+    @hookimpl
+    def fragprune_step(self, stats: StepStats) -> None:
+        """Note the loss."""
+        self.loss = torch.tensor(stats.loss)
 
 
 class _Steps:
@@ -89,6 +102,7 @@ class _Steps:
             optimizers = (each() for each in self.session.optimizers[model])
             moments = {k: each for o in optimizers if o is not None for k, each in o.state.items()}
             of = self._rows(model), stage.store, moments
+            self._compact(of[0])
             self.after_it.enter_context(self.relocation.stepping(stage.steps, *of))
 
     def _begin(self, model: Any) -> dict[str, float]:
@@ -105,6 +119,28 @@ class _Steps:
             rates["xyz"] = self.relocation.rate
             deepen(self.stage.pressure)
         return rates
+
+    def _compact(self, rows: Mapping[str, Tensor]) -> None:
+        """Add the gradient of area's price, in a view of the training, to those of shapes."""
+        of, step = self.of, self.stage.steps
+        assert self.relocation is not None
+        flat = rows["scaling"].shape[1] == 2
+        if of.loss is None or not of.views or flat or self.relocation.over(step):
+            return
+        shapes = {name: rows[name].detach().requires_grad_() for name in ("scaling", "rotation")}
+        with directly(rows["xyz"].device), torch.enable_grad():
+            splats = Splats(
+                rows["xyz"].detach(),
+                rows["opacity"].detach().reshape(-1),
+                scales=shapes["scaling"].exp(),
+                rotations=torch.nn.functional.normalize(shapes["rotation"]),
+                colors=rows["f_dc"].detach().reshape(-1, 3),
+            )
+            inputs = RasterInputs(of.views[step % len(of.views)], splats, planes=())
+            torch.autograd.backward(price(of.loss, area_per_pixel(inputs)))
+        for name, shape in shapes.items():
+            if (grad := rows[name].grad) is not None and shape.grad is not None:
+                grad += shape.grad
 
     def _rows(self, model: Any) -> dict[str, Tensor]:
         """What has a row for each Gaussian, of the parameters, by name or number."""

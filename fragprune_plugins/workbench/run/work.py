@@ -384,6 +384,8 @@ class Looking:
             left = kept(model, trial.keep, shots, views, engine=engine, scores=scores).cpu()
             if trial.keep == "auto" and relocates(model, trial.settings):
                 self.lively.rows = least(scores.cpu()[left])
+        priced = trial.settings.goal.learns
+        self.lively.views = [shot.view for shot in dataset.train] if priced else []
         self.lively.on = self.lively.rows is not None or bool(trial.settings.dropout)
         self.trial, self.gaussians = trial, len(model.xyz)
         return trial.settings, left
