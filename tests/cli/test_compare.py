@@ -162,8 +162,10 @@ def test_profile_has_a_column_with_thresholds_and_one_without(data, path, model,
     text = run("profile", path, "--data", data, "--views", "train").stdout
     assert "7 views" in text
     assert "fragments per pixel" in text
-    report = run_json("profile", path, "--orbit", "--resolution", 16)  # against its own pictures
+    words = ("--orbit", "--resolution", 16, "--out", tmp_path / "own")  # against its own pictures
+    report = run_json("profile", path, *words)
     assert (report["target"], report["columns"]["untruncated"]["psnr"]) == ("itself", None)
+    assert run_json("report", tmp_path / "own")["command"] == "profile"
     assert 10 < report["psnr"] < 80
 
 

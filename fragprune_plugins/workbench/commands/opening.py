@@ -17,7 +17,7 @@ from fragprune_plugins.files.model import Model
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
 from fragprune_plugins.plugins.hooks import engine_for
 from fragprune_plugins.workbench.commands.options import EngineOptions, SceneOptions
-from fragprune_plugins.workbench.figures import records, wording
+from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.ranks import launched, local_rank
 from fragprune_plugins.workbench.scenes import generated, output
 from fragprune_plugins.workbench.scenes.cameras import load_cameras, load_scene_cameras, sized
@@ -171,16 +171,14 @@ def over_its_background(model: Path, scene: SceneOptions) -> SceneOptions:
 
 def own_cameras(record: records.Record, scene: SceneOptions | None = None) -> OwnCameras | None:
     """The cameras of a fine-tuning with --self, with options in their place; else None."""
-    if record.data.get("target") != wording.ITSELF:
+    if (values := record.data.get("cameras")) is None:
         return None
     scene = scene or SceneOptions()
     with records.RECORD_FILE.stated(record.path) as reading:
         reading.place = "data.cameras"
-        values = record.data.get("cameras") or {}
         paths = (values.get(name) for name in ("data", "file"))
         data, cameras = (each and records.located(each, record.path.parent) for each in paths)
-        size = values.get("resolution", 1)  # a divisor in records of earlier versions
-        size = Resolution(**size) if isinstance(size, dict) else Resolution(int(size))
+        size = Resolution(**values["resolution"])
         size = scene.resolution if "resolution" in scene.given else size
         white = scene.white_background or bool(values.get("white_background"))
         scene = replace(scene, data=data or None, resolution=size, white_background=white)
