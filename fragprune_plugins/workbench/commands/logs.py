@@ -27,8 +27,6 @@ from fragprune_plugins.workbench.commands.options import Function
 from fragprune_plugins.workbench.ranks import launched
 
 GROUP = "fragprune.logs"  # the entry-point group of kinds of logs
-
-
 COLUMNS = tuple(each.name for each in fields(StepStats))
 
 
@@ -209,12 +207,6 @@ def _places(
     return places
 
 
-def _opened(kind: EntryPoint, place: str) -> Log:
-    with blaming(kind):
-        log: Log = load(kind, type)(place)
-    return log
-
-
 def log_option(function: Function) -> Function:
     """The option ``--log``: the steps that the command takes are written there."""
 
@@ -231,7 +223,7 @@ def log_option(function: Function) -> Function:
     def logged(*args: Any, logs: list[tuple[EntryPoint, str]], **kwargs: Any) -> Any:
         if not logs or not launched().first:
             return function(*args, **kwargs)
-        with logging_steps([_opened(kind, place) for kind, place in logs]):
+        with logging_steps([blaming(kind)(load(kind, type))(place) for kind, place in logs]):
             return function(*args, **kwargs)
 
     return logged  # type: ignore[return-value]

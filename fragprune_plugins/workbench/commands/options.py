@@ -55,9 +55,6 @@ class Number(click.FloatRange):
 class ModelFile(click.Path):
     """Type of an argument for a model: its file, or the output folder of a training."""
 
-    def __init__(self) -> None:
-        super().__init__(path_type=Path)
-
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
         """The file; of an output folder that of the highest iteration, which is named on stderr."""
         path: Path = super().convert(value, param, ctx)  # type: ignore[assignment]
@@ -79,7 +76,7 @@ class ModelFile(click.Path):
         return newest
 
 
-MODEL = ModelFile()
+MODEL = ModelFile(path_type=Path)
 Option = Callable[[Any], Any]  # what ``click.option`` gives
 
 
