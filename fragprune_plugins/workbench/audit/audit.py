@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -26,8 +26,8 @@ from fragprune_plugins.engines import Engine
 from fragprune_plugins.engines.fragments import fragments
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.schedule import USUAL_STOP
-from fragprune_plugins.types import View, one_line
-from fragprune_plugins.workbench.figures import evaluate, extents, metrics, wording
+from fragprune_plugins.types import RasterInputs, RasterOutputs, View, one_line
+from fragprune_plugins.workbench.figures import evaluate, extents, wording
 from fragprune_plugins.workbench.figures.extents import VIEWERS
 from fragprune_plugins.workbench.scenes.generated import Named
 
@@ -144,90 +144,46 @@ def audit(
     frames of each timed view and cut are timed. Returns figures as plain values, and the views that
     pictures show.
     """
-    survey = _Survey(model, engine)
+    candidates, idle = _candidates(model), Idle()
+    itself = candidates[AS_IT_IS]
+    shown, drawn, asked = list[Shown](), [], []
     parts = min(SHOWN, len(views))  # the middle of each is shown: an orbit begins at a pole
     chosen = [(2 * part + 1) * len(views) // (2 * parts) for part in range(parts)]
-    each = max(1, tiles // len(views))
-    steps = each + 1  # of a view: pictures, then tiles, of which small ones have fewer
-    with tqdm(total=steps * len(views), desc="audit", unit="tile", disable=not progress) as bar:
-        for number, (name, view) in enumerate(views):
-            survey.draw(name, view, shown=number in chosen)
-            bar.update()
-            for _ in survey.weigh(view, each):
-                bar.update()
-            bar.update(steps * (number + 1) - bar.n)
-    timed = [views[number][1] for number in chosen]
-    frames = evaluate.frame_times([*survey.candidates.values()], timed, engine, repeats=repeats)
-    return survey.figures(frames), survey.shown
-
-
-class _Survey:
-    """An audit under way."""
-
-    def __init__(self, model: Model, engine: Engine) -> None:
-        self._model, self._engine = model, engine
-        self.candidates = _candidates(model)
-        self._itself = self.candidates[AS_IT_IS]
-        self.shown: list[Shown] = []
-        self._rows: dict[str, list[dict[str, Any]]] = {name: [] for name in self.candidates}
-        self._asked: dict[str, list[float]] = {}
-        self._overdraw: list[float] = []
-        self._idle = Idle()
-
-    def draw(self, name: str, view: View, *, shown: bool) -> None:
-        """Draw a view of the model and of its cuts."""
-        engine, opacities = self._engine, self._itself.splats.opacities
-        itself = self._itself.draw(engine, view, counts=True)
-        for label, candidate in self.candidates.items():
-            out = itself if label == AS_IT_IS else candidate.draw(engine, view)
-            error = (out.image.clamp(0, 1) - itself.image.clamp(0, 1)).square().mean()
-            row = {key: float(getattr(out, key)) for key in _COUNTS}
-            row |= {"mse": float(error), "psnr": metrics.psnr(out.image, itself.image)}
-            self._rows[label].append(row)
-        inputs = self._itself.inputs(view)
-        squared = extents.SQRT8.squared(opacities)
-        ellipses = extents.covered(engine, replace(inputs, counts=True), squared)
-        self._overdraw.append(float(ellipses.fragments_per_pixel))
-        for viewer in VIEWERS:
-            self._asked.setdefault(viewer.names, []).append(extents.shaded(engine, inputs, viewer))
-        cut = self._itself.thresholds(inputs)
-        if cut is not None:
-            reach = torch.minimum(-2 * cut.log(), 2 * (255 * opacities).log())
-            self._asked.setdefault(HONOURING, []).append(extents.quads(engine, inputs, reach))
-        if shown:
-            assert itself.fragments is not None
-            assert ellipses.fragments is not None
-            self.shown.append(Shown(name, itself.image, itself.fragments, ellipses.fragments))
-
-    def weigh(self, view: View, tiles: int) -> Iterator[None]:
-        """Weigh the fragments of some tiles of a view."""
-        inputs = self._itself.inputs(view)
-        for tile in fragments(inputs, self._itself.thresholds(inputs), tiles):
+    for number, (name, view) in enumerate(tqdm(views, "audit", unit="view", disable=not progress)):
+        inputs = itself.inputs(view)
+        rows, picture = _drawn(candidates, engine, view)
+        drawn.append(rows)
+        asked.append(_asked(itself, engine, inputs))
+        if number in chosen:
+            squared = extents.SQRT8.squared(itself.splats.opacities)
+            ellipses = extents.covered(engine, replace(inputs, counts=True), squared).fragments
+            assert picture.fragments is not None
+            assert ellipses is not None
+            shown.append(Shown(name, picture.image, picture.fragments, ellipses))
+        for tile in fragments(inputs, itself.thresholds(inputs), max(1, tiles // len(views))):
             if len(tile.rows):
-                self._idle.add(tile, view.background)
-            yield
-
-    def figures(self, frames: Sequence[dict[str, Any]]) -> dict[str, Any]:
-        """Everything as plain values, with the frame times of each candidate."""
-        cuts: list[dict[str, Any]] = [
-            {"name": label} | _mean(rows) | frame
-            for (label, rows), frame in zip(self._rows.items(), frames, strict=True)
-        ]
-        same = ("fragments_per_pixel", "evaluated_per_pixel", "frame_ms", "frame_ms_se")
-        return {
-            "gaussians": len(self._model),
-            "truncated": self._model.falloff is not None,
-            **self._model.rules,
-            "views": len(self._overdraw),
-            "overdraw": statistics.fmean(self._overdraw),
-            **{name: cuts[0][name] for name in same},
-            "frame_size": wording.sizes([(*each.fragments.shape[::-1],) for each in self.shown]),
-            "engine": self._engine.name,
-            "device": str(self._model.device),
-            "idle": self._idle.as_dict(),
-            "cuts": cuts,
-            "viewers": _viewers(self._asked),
-        }
+                idle.add(tile, view.background)
+    timed = [views[number][1] for number in chosen]
+    frames = evaluate.frame_times([*candidates.values()], timed, engine, repeats=repeats)
+    cuts = [
+        {"name": name} | _mean([rows[name] for rows in drawn]) | frame
+        for name, frame in zip(candidates, frames, strict=True)
+    ]
+    viewers = _viewers(asked)
+    return {
+        "gaussians": len(model),
+        "truncated": model.falloff is not None,
+        **model.rules,
+        "views": len(views),
+        "overdraw": math.pi / 4 * viewers[0]["shaded_per_pixel"],  # quads of √8 sigma
+        **{key: cuts[0][key] for key in (*_COUNTS, "frame_ms", "frame_ms_se")},
+        "frame_size": wording.sizes([(*each.fragments.shape[::-1],) for each in shown]),
+        "engine": engine.name,
+        "device": str(model.device),
+        "idle": idle.as_dict(),
+        "cuts": cuts,
+        "viewers": viewers,
+    }, shown
 
 
 def _candidates(model: Model) -> dict[str, evaluate.Candidate]:
@@ -245,21 +201,43 @@ def _candidates(model: Model) -> dict[str, evaluate.Candidate]:
     return found
 
 
-def _mean(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+def _drawn(
+    candidates: Mapping[str, evaluate.Candidate], engine: Engine, view: View
+) -> tuple[dict[str, dict[str, float]], RasterOutputs]:
+    """What each candidate draws of a view, with its squared error; and the picture as it is."""
+    itself, rows = candidates[AS_IT_IS].draw(engine, view, counts=True), {}
+    for name, candidate in candidates.items():
+        out = itself if name == AS_IT_IS else candidate.draw(engine, view)
+        error = (out.image.clamp(0, 1) - itself.image.clamp(0, 1)).square().mean()
+        rows[name] = {key: float(getattr(out, key)) for key in _COUNTS} | {"mse": float(error)}
+    return rows, itself
+
+
+def _asked(itself: evaluate.Candidate, engine: Engine, inputs: RasterInputs) -> dict[str, float]:
+    """Pixels that each viewer is asked to shade for one of a view."""
+    found = {each.names: extents.shaded(engine, inputs, each) for each in VIEWERS}
+    if (cut := itself.thresholds(inputs)) is not None:
+        reach = torch.minimum(-2 * cut.log(), 2 * (255 * itself.splats.opacities).log())
+        found[HONOURING] = extents.quads(engine, inputs, reach)
+    return found
+
+
+def _mean(rows: Sequence[Mapping[str, float]]) -> dict[str, Any]:
     """Means over views; PSNR of the mean squared error and of the worst view, infinite if equal."""
-    error = statistics.fmean(row["mse"] for row in rows)
+    errors = [row["mse"] for row in rows]
+    ends = {"psnr": statistics.fmean(errors), "worst_psnr": max(errors)}
     return {key: statistics.fmean(row[key] for row in rows) for key in _COUNTS} | {
-        "psnr": -10 * math.log10(error) if error else math.inf,
-        "worst_psnr": min(row["psnr"] for row in rows),
+        key: -10 * math.log10(error) if error else math.inf for key, error in ends.items()
     }
 
 
-def _viewers(asked: Mapping[str, Sequence[float]]) -> list[dict[str, Any]]:
+def _viewers(asked: Sequence[Mapping[str, float]]) -> list[dict[str, Any]]:
+    """Of each viewer its rule, and the mean over views of what it is asked to shade."""
     rules = {each.names: {"rule": each.extent.name, "shape": each.shape} for each in VIEWERS}
     rules[HONOURING] = {"rule": "quads by cutoffs, 1/255", "shape": "quad"}
-    first, found = statistics.fmean(asked[VIEWERS[0].names]), []
-    for names, pixels in asked.items():
-        mean = statistics.fmean(pixels)
+    means = {name: statistics.fmean(each[name] for each in asked) for name in asked[0]}
+    first, found = means[VIEWERS[0].names], []
+    for name, mean in means.items():
         share = {"shaded_per_pixel": mean, "against_sqrt8": mean / first if first else math.nan}
-        found.append({"viewers": names, **rules[names], **share})
+        found.append({"viewers": name, **rules[name], **share})
     return found
