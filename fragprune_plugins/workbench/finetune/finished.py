@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -252,17 +253,12 @@ class Finetuned:
 
 def finished(opened: Opened) -> Report | None:
     """The report of the same command, if it has written its ``--out`` already; else None."""
-    model, out, asked = opened.asked.model, opened.asked.out, opened.configuration
-    if not out.is_file():
+    model, out, record = opened.asked.model, opened.asked.out, None
+    with contextlib.suppress(RecordError):
+        record = records.beside(out) if out.is_file() else None
+    if record is None or record.data.get("configuration") != opened.configuration:
         return None
-    try:
-        record = records.beside(out)
-    except RecordError:
-        return None
-    if record is None or record.data.get("configuration") != asked:
-        return None
-    written = Path(str(record.data.get("out"))).name
-    if written != out.name:  # a model of the same name in another format
+    if Path(str(record.data.get("out"))).name != out.name:  # of the same name in another format
         return None
     data = {key: value for key, value in record.data.items() if key not in _OF_RECORDS}
     none, since = data.get("control"), records.control_of(data, records.files(out.parent))

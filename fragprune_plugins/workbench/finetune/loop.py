@@ -387,13 +387,10 @@ def order(
 
     The global random streams are not touched.
     """
-    stream = random.Random(seed)
-    queue: list[Shot] = []
+    stream, queue = random.Random(seed), list[Shot]()
     for _ in range(steps):
-        chosen: list[Shot] = []
-        for _ in range(views_per_step):
-            if not queue:
-                queue = list(views)
-                stream.shuffle(queue)
-            chosen.append(queue.pop())
-        yield chosen
+        while len(queue) < views_per_step:
+            again = list(views)
+            stream.shuffle(again)
+            queue = again + queue
+        yield [queue.pop() for _ in range(views_per_step)]

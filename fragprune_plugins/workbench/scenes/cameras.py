@@ -67,10 +67,8 @@ def load_scene_cameras(
     """Read the named training and held-out views of a scene folder, at their cameras' own sizes."""
     background = torch.full((3,), float(white_background))
     parts = dataset.read_scene(folder, split=False)
-    if not all(parts):
-        parts = posed.hold_out(
-            [*parts[0], *parts[1]]
-        )  # of a single one there is none to learn from
+    if not all(parts):  # of a single one there is none to learn from
+        parts = posed.hold_out([*parts[0], *parts[1]])
     train, test = ([(row.name, row.camera.view(background)) for row in part] for part in parts)
     return train, test
 

@@ -38,7 +38,18 @@ class Camera:
 
     def __post_init__(self) -> None:
         check_lens(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
-        check_pose(self.rotation, self.translation)
+        check_tensor("rotation", self.rotation, 3, 3, needed=True)
+        check_tensor("translation", self.translation, 3, needed=True)
+        exact, place = self.rotation.detach().double(), self.translation.detach()
+        skew = float((exact @ exact.T - torch.eye(3).to(exact)).abs().max())
+        # NaN, too, is not within the tolerance.
+        if not (skew <= ROTATION_TOLERANCE and float(torch.linalg.det(exact)) > 0):
+            found = f"{[[float(f'{value:.4g}') for value in row] for row in exact.tolist()]}"
+            expected = "a rotation: finite, orthonormal, not mirrored"
+            raise InputError("rotation", found, expected, "Check the camera.")
+        if not float(place.abs().max()) <= DISTANCE_MAX:
+            expected = f"finite, at most {DISTANCE_MAX:g} world units"
+            raise InputError("translation", f"{place.tolist()}", expected, "Check the camera.")
 
     @property
     def off_centre(self) -> float:
@@ -62,22 +73,6 @@ class Camera:
 def focal(side: float, angle: float) -> float:
     """The focal length of a camera that sees a side of its picture under an angle, radians."""
     return side / (2 * math.tan(angle / 2))
-
-
-def check_pose(rotation: Tensor, translation: Tensor) -> None:
-    """Raise InputError unless it is a rotation, and a place within ``DISTANCE_MAX``."""
-    check_tensor("rotation", rotation, 3, 3, needed=True)
-    check_tensor("translation", translation, 3, needed=True)
-    exact = rotation.detach().double()
-    skew = float((exact @ exact.T - torch.eye(3).to(exact)).abs().max())
-    # NaN, too, is not within the tolerance.
-    if not (skew <= ROTATION_TOLERANCE and float(torch.linalg.det(exact)) > 0):
-        found = f"{[[float(f'{value:.4g}') for value in row] for row in exact.tolist()]}"
-        expected = "a rotation: finite, orthonormal, not mirrored"
-        raise InputError("rotation", found, expected, "Check the camera.")
-    if not float(translation.detach().abs().max()) <= DISTANCE_MAX:
-        expected = f"finite, at most {DISTANCE_MAX:g} world units"
-        raise InputError("translation", f"{translation.tolist()}", expected, "Check the camera.")
 
 
 def look_at(
