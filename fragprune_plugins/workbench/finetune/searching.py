@@ -56,37 +56,32 @@ class Bounded:
 
     Attributes:
         bound: on the loss, dB.
-        result: the strongest truncation within the bound; the one that loses least where none is;
-            the last training before any was measured.
-        trial: its figures; None if the search was interrupted before they were taken.
-        trials: all of them, in order.
+        result: the training of ``trial``; the last one before any was measured.
+        trials: figures of all that were measured, in order.
     """
 
     bound: float
     control: FinetuneResult
     result: FinetuneResult
-    trial: Trial | None = None
     trials: list[Trial] = field(default_factory=list)
 
-    def take(self, result: FinetuneResult, trial: Trial) -> None:
-        """Take a training into account."""
-        self.trials.append(trial)
-        if self.trial is None or _better(trial, self.trial, self.bound):
-            self.result, self.trial = result, trial
+    @property
+    def trial(self) -> Trial | None:
+        """That which draws least within the bound; where none is within, that which loses least."""
 
-    def ended(self, last: FinetuneResult, terminated: bool) -> Bounded:
-        """The same after a signal, which came in or after the last training."""
-        best = last if self.trial is None else self.result
-        self.result = replace(best, interrupted=True, terminated=terminated)
-        return self
+        def rank(trial: Trial) -> tuple[bool, float]:
+            kept = trial.loss <= self.bound
+            return not kept, trial.fragments_per_pixel if kept else trial.loss
+
+        return min(self.trials, key=rank, default=None)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for ``--json``: bound, met, the chosen trial's figures, all trials."""
-        chosen = {} if self.trial is None else asdict(self.trial)
+        chosen = self.trial
         return {
             "bound": self.bound,
-            "met": self.trial is not None and self.trial.loss <= self.bound,
-            **chosen,
+            "met": chosen is not None and chosen.loss <= self.bound,
+            **({} if chosen is None else asdict(chosen)),
             "trials": [asdict(trial) for trial in self.trials],
         }
 
@@ -115,6 +110,8 @@ def strongest(
             at = "the default pressure" if pressure is None else f"pressure {pressure:.2g}"
             say(f"Training {len(found.trials) + 1} of at most {TRAININGS}, at {at}.")
             last = train(replace(settings, goal=Pressure(pressure)))
+            if not found.trials:
+                found.result = last
             if last.interrupted:
                 break
             figures, fragments = _held_out(last, held_out, engine)
@@ -122,15 +119,19 @@ def strongest(
             loss, error = statistics.fmean(losses), standard_error(losses)
             trial = Trial(last.progress.pressure, loss, error, fragments)
             say(f"Loss against the control: {loss:.3f} dB at {fragments:.1f} fragments/pixel.")
-            found.take(last, trial)
+            found.trials.append(trial)
+            if found.trial is trial:
+                found.result = last
             few = fragments * FEWEST < (last.progress.fragments_before or 0.0)
             near = loss >= found.bound - TOLERANCE
             if (loss <= found.bound and (few or near)) or pressure == _STRONGEST:
                 break
             pressure = min(next_pressure(found.trials, found.bound), _STRONGEST)
+        interrupted, terminated = last.interrupted, last.terminated
     except KeyboardInterrupt as error:  # not in a training, which ends by itself
-        return found.ended(last, isinstance(error, Terminate))
-    return found.ended(last, last.terminated) if last.interrupted else found
+        interrupted, terminated = True, isinstance(error, Terminate)
+    found.result = replace(found.result, interrupted=interrupted, terminated=terminated)
+    return found
 
 
 def next_pressure(trials: Sequence[Trial], bound: float) -> float:
@@ -154,13 +155,6 @@ def next_pressure(trials: Sequence[Trial], bound: float) -> float:
     low, high = sorted((weaker.pressure, stronger.pressure))
     margin = 0.1 * (high - low)
     return min(max(found, low + margin), high - margin)
-
-
-def _better(trial: Trial, than: Trial, bound: float) -> bool:
-    """Whether a trial keeps the bound and draws less, or neither does and it loses less."""
-    if trial.loss <= bound and than.loss <= bound:
-        return trial.fragments_per_pixel < than.fragments_per_pixel
-    return trial.loss < than.loss
 
 
 def _held_out(
