@@ -260,11 +260,6 @@ class Shards(Processes):
     def stepped(self, learned: Mapping[str, Tensor], step: int, *, last: bool = False) -> None:
         """Do nothing: no two processes hold the same Gaussian."""
 
-    def described(self, configuration: dict[str, Any]) -> dict[str, Any]:
-        """As the processes have it, but for the digests of their parts, which are in a list."""
-        parts = {name: self.ranks.gather(configuration[name]) for name in ("model", "thresholds")}
-        return configuration | parts
-
     def total(self, count: int) -> int:
         """Gaussians of all processes."""
         return sum(self.counts)

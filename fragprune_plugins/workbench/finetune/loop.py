@@ -16,7 +16,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from fragprune_plugins.engines import Engine
-from fragprune_plugins.errors import CheckpointError, SidecarError
+from fragprune_plugins.errors import CheckpointError
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.adam import EPSILON, stepping_fused
 from fragprune_plugins.learning.area import area_per_pixel
@@ -48,10 +48,6 @@ docs/experiments/defaults.md. Its own pictures teach worse so: 29.75 dB in place
 _POSTFIXES = 100  # times in a run that the bar says how it goes
 
 _OF_VIEWS = {"before", "after"}  # of stage 2's tensors; all others have a row for each Gaussian
-_UNFIT = (  # raised where the parts of a checkpoint do not fit what they are loaded into
-    *(KeyError, ValueError, TypeError, IndexError, RuntimeError, AttributeError, OverflowError),
-    SidecarError,
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +159,10 @@ class Training:
         """Take over what a checkpoint holds, if there is one, in all processes."""
         processes, device = self.processes, self.start.device
         given = self.start, self.dataset, self.settings, self.engine.name
-        asked = processes.described(configuration(*given, self.stage.schedule))
+        asked = configuration(*given, self.stage.schedule)
+        if processes.divided:  # digests of all parts
+            names = ("model", "thresholds")
+            asked |= {name: processes.ranks.gather(asked[name]) for name in names}
         moves = None if self.relocation is None else self.relocation.moved(self.settings.iterations)
         self._configuration = asked | {"loss": code_for(device), "moves": moves}
         if checkpoints is not None:
@@ -172,7 +171,7 @@ class Training:
             if values:
                 try:
                     self._load_state_dict(tensors, values)
-                except _UNFIT as error:
+                except Exception as error:  # as of any file that somebody else may have written
                     raise CheckpointError(
                         str(checkpoints.path),
                         f"parts that do not fit together ({error})",
@@ -215,7 +214,7 @@ class Training:
         }
 
     def _load_state_dict(self, tensors: dict[str, Tensor], values: dict[str, Any]) -> None:
-        """Take over what ``_state_dict`` gave; raises one of ``_UNFIT`` if it does not fit."""
+        """Take over what ``_state_dict`` gave; raises anything if its parts do not fit."""
         stage = self.stage
         if self.relocation is not None:
             self.relocation.pull.copy_(tensors.pop("pull"))

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -124,10 +123,6 @@ class Processes:
         if self.ranks.several and (last or step % _COMPARE == 0):
             known = {name: fingerprint(tensor) for name, tensor in learned.items()}
             self.ranks.agree(known, f"fine-tuning, after step {step}")
-
-    def described(self, configuration: dict[str, Any]) -> dict[str, Any]:
-        """What decides the result, in the words of all processes together."""
-        return configuration
 
     def total(self, count: int) -> int:
         """Gaussians of the whole model, from those that this process holds."""
