@@ -48,34 +48,27 @@ class CsvLog:
     """
 
     def __init__(self, path: str) -> None:
-        self._path = Path(path)
+        self._path, self._begun = Path(path), False
         try:
-            if self._path.is_file() and not self._is_ours():
+            self._before = self._path.read_text("utf-8", "replace") if self._path.is_file() else ""
+            if self._before and not self._before.startswith(f"{COLUMNS[0]},"):
                 raise OSError("a file that is no log")
             self._file = open(self._path, "a", newline="", encoding="utf-8")  # noqa: SIM115
         except (OSError, ValueError) as error:  # ValueError: a NUL in the name
             why = getattr(error, "strerror", None) or str(error)
             raise OutputError(path, why, "a file for --log", "Choose another place.") from error
         self._rows = csv.writer(self._file)
-        self._begun = False
-
-    def _is_ours(self) -> bool:
-        """Whether the file is empty, or begins as a log does."""
-        begin = f"{COLUMNS[0]},".encode()
-        with open(self._path, "rb") as file:
-            return file.read(len(begin)) in (b"", begin)
 
     def _begin(self, first: int) -> None:
         """Write the heads of the columns, and again the rows that stay."""
         self._begun = True
-        before = self._path.read_text("utf-8", "replace") if self._path.is_file() else ""
-        rows = [row.split(",") for row in before.splitlines()[1:]]
+        rows = [row.split(",") for row in self._before.splitlines()[1:]]
         whole = (row for row in rows if row[0].isdecimal() and len(row) == len(COLUMNS))
         kept = [row for row in whole if int(row[0]) < first]
         if rows:
             said = "%s has rows of an earlier run: %d stay, %d go"
             told.warning(said, self._path, len(kept), len(rows) - len(kept))
-        if before:
+        if self._before:
             self._file.truncate(0)
         self._rows.writerows([COLUMNS, *kept])
 

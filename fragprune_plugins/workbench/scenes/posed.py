@@ -6,7 +6,7 @@ OpenCV straightens photographs: cameras have lens distortion, rasterization has 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -52,11 +52,11 @@ class Lens:
 
         It has as many pixels, and sees as much as it can without a pixel that the photograph lacks.
         """
-        own = self._camera(rotation, translation)
+        size = self.width, self.height
+        own = Camera(rotation, translation, *size, self.fx, self.fy, self.cx, self.cy)
         if self.straight:
             return own
-        cv2, size = _opencv(), (self.width, self.height)
-        matrix, bend = _matrix(own), np.array(self.coefficients)
+        cv2, matrix, bend = _opencv(), _matrix(own), np.array(self.coefficients)
         if self.fisheye:
             estimate = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify
             found = estimate(matrix, bend, size, np.eye(3), balance=0.0)
@@ -65,20 +65,13 @@ class Lens:
         fx, fy, cx, cy = (float(found[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
         return Camera(rotation, translation, *size, fx, fy, cx + 0.5, cy + 0.5)
 
-    def _camera(self, rotation: Tensor, translation: Tensor) -> Camera:
-        """The camera of the photograph itself, without its distortion."""
-        numbers = (self.width, self.height, self.fx, self.fy, self.cx, self.cy)
-        return Camera(rotation, translation, *numbers)
-
     def straighten(self, pixels: Pixels, camera: Camera) -> Pixels:
-        """A photograph (H, W, channels), of any size with its aspect, as ``camera`` sees it."""
-        cv2 = _opencv()
-        height, width = pixels.shape[:2]
-        seen = _matrix(camera.resized(width, height))
-        here = self._camera(camera.rotation, camera.translation).resized(width, height)
+        """A photograph (H, W, channels), of any size with its aspect, as its ``camera`` sees it."""
+        cv2, size = _opencv(), pixels.shape[1::-1]
+        own = replace(camera, fx=self.fx, fy=self.fy, cx=self.cx, cy=self.cy)
+        here, seen = (_matrix(each.resized(*size)) for each in (own, camera))
         make = cv2.fisheye.initUndistortRectifyMap if self.fisheye else cv2.initUndistortRectifyMap
-        bend, size = np.array(self.coefficients), (width, height)
-        maps = make(_matrix(here), bend, np.eye(3), seen, size, cv2.CV_32FC1)
+        maps = make(here, np.array(self.coefficients), np.eye(3), seen, size, cv2.CV_32FC1)
         edge = cv2.BORDER_REPLICATE
         straight: Pixels = cv2.remap(pixels, *maps, cv2.INTER_LINEAR, borderMode=edge)
         return straight.reshape(pixels.shape)

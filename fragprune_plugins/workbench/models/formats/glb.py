@@ -59,8 +59,8 @@ def read(reading: Reading) -> Model:
     names = [(f"{BASE}:ROTATION", 4), (f"{BASE}:SCALE", 3), (f"{BASE}:OPACITY", 1)]
     parts = [column(*each) for each in names] + [column(name, 3) for name in sh]
     ours: dict[str, Any] = primitive["extensions"][BASE].get("extensions", {})
-    extension = ours.get(CUTOFF)
-    cut = extension is not None and ("stop" not in extension or _THRESHOLD in attributes)
+    rules = ours.get(CUTOFF, {})
+    cut = CUTOFF in ours and ("stop" not in rules or _THRESHOLD in attributes)
     cutoff = column(_THRESHOLD, 1)[:, 0] if cut else None
     reading.place = ""
     if any(len(part) != len(xyz) for part in (*parts, *(() if cutoff is None else (cutoff,)))):
@@ -74,8 +74,8 @@ def read(reading: Reading) -> Model:
         log_scales=arrays.logs_of(scale),
         rotations=rotation[:, [3, 0, 1, 2]],
         thresholds=None if cutoff is None else torch.from_numpy(cutoff.copy()),
-        stop=None if extension is None else extension.get("stop"),
-        rim="hard" if extension is None else extension.get("rim", "hard"),
+        stop=rules.get("stop"),
+        rim=rules.get("rim", "hard"),
     )
     return arrays.turned(splat, _AXES)
 
