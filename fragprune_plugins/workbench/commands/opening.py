@@ -101,13 +101,10 @@ def warn_if_antialiased(*models: Path) -> None:
 
 def overridden(photographs: Photographs, scene: SceneOptions) -> Photographs:
     """Photographs of a record, with the options that the user gave in place of what it says."""
-    values: dict[str, Any] = {
-        "folder": scene.data,
-        "images": scene.images if "images" in scene.given else None,
-        "resolution": scene.resolution if "resolution" in scene.given else None,
-        "white_background": scene.white_background or None,
-    }
-    return replace(photographs, **{key: each for key, each in values.items() if each is not None})
+    given = {name: getattr(scene, name) for name in ("images", "resolution") if name in scene.given}
+    white = scene.white_background or photographs.white_background
+    folder = scene.data or photographs.folder
+    return replace(photographs, folder=folder, white_background=white, **given)
 
 
 def chosen(dataset: Dataset, views: str) -> Sequence[Shot]:
