@@ -97,7 +97,7 @@ RULES = (
     "processes under torchrun, which draw them side by side.",
 )
 @shared.shard_option
-@click.option("--no-truncation", is_flag=True, help="Ignore cutoffs stored with MODEL.")
+@shared.truncation_option
 @click.option(
     "--again", is_flag=True, help="Begin anew, though OUT is finished or there is a checkpoint."
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import random
+import statistics
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import astuple, dataclass, replace
@@ -287,12 +288,9 @@ class Training:
 
     def _how_it_goes(self) -> dict[str, str]:
         """Means over as many steps as see all views: these differ more than steps do."""
-        views = len(self.dataset.train)
-        last = self.curves[-max(1, views // self.settings.views_per_step) :]
-        loss, drawn = (
-            sum(getattr(point, name) for point in last) / len(last)
-            for name in ("loss", "fragments_per_pixel")
-        )
+        last = self.curves[-max(1, len(self.dataset.train) // self.settings.views_per_step) :]
+        loss = statistics.fmean(point.loss for point in last)
+        drawn = statistics.fmean(point.fragments_per_pixel for point in last)
         return {"loss": f"{loss:.4f}", "fragments": f"{drawn:.1f}/px"}
 
     def _watched(self, stats: StepStats) -> None:

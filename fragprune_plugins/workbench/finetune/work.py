@@ -15,14 +15,8 @@ from fragprune_plugins.errors import UsageError, printable
 from fragprune_plugins.files.atomic import locked
 from fragprune_plugins.files.model import Model
 from fragprune_plugins.learning.interruption import sigterm_interrupts
+from fragprune_plugins.workbench.commands import opening, options
 from fragprune_plugins.workbench.commands.command import Report
-from fragprune_plugins.workbench.commands.opening import (
-    open_engine,
-    own_cameras_for,
-    photographs_for,
-    warn_if_antialiased,
-)
-from fragprune_plugins.workbench.commands.options import require_several
 from fragprune_plugins.workbench.distributed import ShardedEngine, part_of, whole_of
 from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.figures.evaluate import Candidate
@@ -47,11 +41,11 @@ from fragprune_plugins.workbench.scenes.training import exposed, moved, saw_held
 _say = partial(click.echo, err=True)
 
 
-def finetune(**options: Any) -> Report | None:
+def finetune(**fields: Any) -> Report | None:
     """Fine-tune, with the fields of ``Asked``; the report, in the first process."""
-    asked = Asked(**options)
+    asked = Asked(**fields)
     if asked.shard:
-        require_several()
+        options.require_several()
     if launched().first:
         require_place(asked.out, asked.model, thresholds=asked.settings.goal.learns)
         lock = locked(asked.out, wait=0, what="run")
@@ -87,7 +81,9 @@ def _open(asked: Asked) -> Opened:
     scene, settings, photographs = asked.scene, asked.settings, None
     if scene.data is not None or not asked.itself:
         remedy = "Pass --data FOLDER with photographs; without any, --self."
-        photographs = asked.photographs or photographs_for(asked.model, scene, remedy=remedy)
+        photographs = asked.photographs or opening.photographs_for(
+            asked.model, scene, remedy=remedy
+        )
         if not asked.itself and (name := exposed(asked.model)):
             raise UsageError(
                 "MODEL",
@@ -95,15 +91,15 @@ def _open(asked: Asked) -> Opened:
                 "a model whose pictures are like its photographs as they are",
                 "Learn from its own pictures: --self.",
             )
-    engine, device = open_engine(asked.engine)
+    engine, device = opening.open_engine(asked.engine)
     keep_freed_memory()
     truncation = settings.goal.presses and not asked.no_truncation
     where = "cpu" if asked.shard else device
     whole = models.load(asked.model, truncation=truncation, device=where)
     api.expect_fit(whole, settings)
-    warn_if_antialiased(asked.model)
+    opening.warn_if_antialiased(asked.model)
     if asked.itself:
-        own = own_cameras_for(asked.model, scene, asked.cameras, asked.seed)
+        own = opening.own_cameras_for(asked.model, scene, asked.cameras, asked.seed)
         asked = replace(asked, scene=own.scene, cameras=own.cameras)
         dataset = own.pictures(whole, engine)
     else:
