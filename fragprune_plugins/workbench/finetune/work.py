@@ -85,12 +85,9 @@ def _open(asked: Asked) -> Opened:
             asked.model, scene, remedy=remedy
         )
         if not asked.itself and (name := exposed(asked.model)):
-            raise UsageError(
-                "MODEL",
-                f"its training learned an exposure for {printable(name)}: exposure.json",
-                "a model whose pictures are like its photographs as they are",
-                "Learn from its own pictures: --self.",
-            )
+            found = f"its training learned an exposure for {name}: exposure.json"
+            expected = "a model whose pictures are like its photographs as they are"
+            raise UsageError("MODEL", found, expected, "Learn from its own pictures: --self.")
     engine, device = opening.open_engine(asked.engine)
     keep_freed_memory()
     truncation = settings.goal.presses and not asked.no_truncation
