@@ -112,7 +112,7 @@ class Finetuned:
         after = self.result.model
         if self._rounds and not self._as_learned:
             after = load(self.asked.out, device=after.device)
-        whole = self.result.progress.gaussians if self.shards > 1 else None
+        whole = self.result.progress.gaussians
         models = {"before": self.start, "after": Candidate(after, gaussians=whole)}
         if self.truncated:
             models["untruncated"] = Candidate(after.untruncated(), gaussians=whole)
@@ -152,17 +152,17 @@ class Finetuned:
         return Report(data, f"{text}\n{then}", exit_code=130 if result.interrupted else code)
 
     def _data(self, figures: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
-        """What the record and ``--json`` say."""
+        """What the record and ``--json`` say; figures may be missing."""
         asked, result, settings = self.asked, self.result, self.result.settings
-        after, control, done = figures["after"], figures.get("control"), result.progress
+        after, control, done = figures.get("after", {}), figures.get("control"), result.progress
         if self.found is not None and self.found.control.progress.steps > done.steps:
             control = None  # it trained longer: the result was interrupted
         data: dict[str, Any] = {
             "model": str(asked.model),
             "out": str(asked.out),
-            "target": after["target"],
-            "before": figures["before"],
-            "after": after,
+            "target": after.get("target"),
+            "before": figures.get("before"),
+            "after": after or None,
             "untruncated": figures.get("untruncated"),
             "self": asked.itself,
             "seen": self.opened.seen,
@@ -180,15 +180,16 @@ class Finetuned:
             "pressure": done.pressure if settings.goal.presses else None,
             "train_seconds": result.train_seconds,
             "engine": result.engine,
-            "device": after["device"],
+            "device": after.get("device"),
             "adapter": None,
             "seed": asked.seed,
             "shards": self.shards,
             "settings": settings.as_dict(),
             "max_drop": None if self.found is None else self.found.as_dict(),
         }
-        data["control"] = control or records.control_of(data, records.files(asked.out.parent))
-        return data
+        if control is None and after:
+            control = records.control_of(data, records.files(asked.out.parent))
+        return data | {"control": control}
 
     def _text(self, data: dict[str, Any]) -> str:
         """What a person reads."""
@@ -227,21 +228,9 @@ class Finetuned:
 
     def terminated(self) -> Report:
         """The report after SIGTERM: the model is saved, and nothing is measured."""
-        asked, result, settings = self.asked, self.result, self.result.settings
-        data = {
-            "model": str(asked.model),
-            "out": str(asked.out),
-            "before": None,
-            "after": None,
-            "interrupted": True,
-            "iterations": result.progress.steps,
-            "train_seconds": result.train_seconds,
-            "engine": result.engine,
-            "settings": settings.as_dict(),
-        }
-        at = f"SIGTERM at {result.progress.steps} of {settings.iterations} iterations."
-        text = f"{at} Wrote {asked.out}. {self._goes_on()}"
-        return Report(data, text, exit_code=EXIT_CODE)
+        at = f"{self.result.progress.steps} of {self.result.settings.iterations} iterations"
+        text = f"SIGTERM at {at}. Wrote {self.asked.out}. {self._goes_on()}"
+        return Report(self._data({}), text, exit_code=EXIT_CODE)
 
     def _goes_on(self) -> str:
         if self.found is not None:
