@@ -126,17 +126,12 @@ def opengl_pose(to_world: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 def _listed(file: str) -> Path:
     """A path that a transforms file lists, to compare with others: its suffix may differ."""
-    path = _path(file)
-    return path.with_name(_name(path))
+    return _path(file).with_suffix("")
 
 
 def _path(file: str) -> Path:
     """A path that a transforms file lists, which may have been written on Windows."""
     return Path(PureWindowsPath(file).as_posix())
-
-
-def _name(image: Path) -> str:
-    return image.name.rsplit(".", 1)[0]
 
 
 def _row(folder: Path, frame: dict[str, Any], images: str) -> Posed:
@@ -158,7 +153,7 @@ def _row(folder: Path, frame: dict[str, Any], images: str) -> Posed:
     pose = opengl_pose(matrix(frame["transform_matrix"], (4, 4), (3, 4))[:3])
     mask = folder / frame["mask_path"] if frame.get("mask_path") else None
     bent = None if lens.straight else lens
-    return Posed(_name(listed), lens.camera(*pose), image, bent, mask)
+    return Posed(listed.stem, lens.camera(*pose), image, bent, mask)
 
 
 def _distortion(frame: dict[str, Any]) -> tuple[bool, tuple[float, ...]]:
