@@ -12,14 +12,11 @@ from fragprune_plugins.workbench.commands.options import FILE, MODEL, engine_opt
 from fragprune_plugins.workbench.commands.rules import Alone, Needs
 
 
-def _sizes(
-    ctx: click.Context, param: click.Parameter, words: tuple[str, ...]
-) -> list[tuple[int, int]]:
-    """Width and height of each word such as 640x480."""
-    for word in words:
-        if not re.fullmatch(r"0*[1-9]\d*x0*[1-9]\d*", word):
-            raise click.BadParameter(f"{word!r} is not WIDTHxHEIGHT, such as 640x480.")
-    return [(int(width), int(height)) for width, height in (word.split("x") for word in words)]
+def _size(word: str) -> tuple[int, int]:
+    """Width and height of a word such as 640x480."""
+    if not (found := re.fullmatch(r"(0*[1-9]\d*)x(0*[1-9]\d*)", word)):
+        raise click.BadParameter(f"{word!r} is not WIDTHxHEIGHT, such as 640x480.")
+    return int(found[1]), int(found[2])
 
 
 RULES = (
@@ -36,7 +33,8 @@ RULES = (
     "sizes",
     multiple=True,
     default=("640x480", "1280x960"),
-    callback=_sizes,
+    type=_size,
+    metavar="WIDTHxHEIGHT",
     help="Image size; may be given several times.",
 )
 @click.option(

@@ -29,7 +29,7 @@ def bench(
     *,
     model: Path | None,
     cameras: Path | None,
-    sizes: list[Size],
+    sizes: tuple[Size, ...],
     gaussians: tuple[int, ...],
     engine: options.EngineOptions,
 ) -> command.Report:
@@ -50,7 +50,7 @@ def bench(
 
 
 def _of_model(
-    model: Path, cameras: Path | None, sizes: list[Size], device: torch.device
+    model: Path, cameras: Path | None, sizes: tuple[Size, ...], device: torch.device
 ) -> list[timing.Case]:
     """A model from its first camera, in each image size."""
     cameras = cameras or cameras_of(model)
