@@ -155,6 +155,7 @@ def chosen(given):
 """
 
 
+NO_MODEL = "no model of this family that saves a PLY was found"
 BOXED = """
     if training:
         boxed, shades = pc.get_xyz[pc.box], pc.get_features[pc.box]
@@ -360,9 +361,32 @@ def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):
     assert reason in verdict.sentence
 
 
+DROPPED = (
+    ("override_color=None):", "override_color=None, iteration=None):"),
+    ("scene.save(", "render(training=True, iteration=iteration), scene.save("),
+    ("* pc.dropout", "* dropped(iteration / 1000)"),
+)
+JOINED_DC = "    both = torch.cat([dc, shs], dim=1)\n    drawn"
+GIVEN_DC = (
+    ("override_color=None):", "override_color=None, dc=None):"),
+    (END, GSPLAT.format("both").replace("    drawn", JOINED_DC)),
+)
+STILL = (
+    ("{'params': [], 'name': 'f_dc'}", "{'params': [self._opacity]}"),
+    (
+        ".repeat(1, 3)\n",
+        ".repeat(1, 3)\n        self._xyz = nn.Parameter(p.requires_grad_(False))\n",
+    ),
+)
+
+
 @pytest.mark.parametrize(
-    ("old", "new"),
+    "changes",
     [
+        DROPPED,
+        GIVEN_DC,
+        STILL,
+        ("scene.save(", "scene_static.save("),
         ("means3D = pc.get_xyz", "means3D = moved(viewpoint_camera.pose, pc.get_xyz)"),
         ('"opacity"]', '"opacity", "obj_dc_0"]'),
         ("= self._opacity.detach()", "= self.inverse_activation(self.get_opacity)"),
@@ -406,8 +430,8 @@ def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):
         (".repeat(1, 3)", ".repeat(1, 2)\n        scales = torch.cat([scales, thin], dim=-1)"),
     ],
 )
-def test_what_leaves_the_picture_alone_is_plain(fork, old, new):
-    assert read_plain(fork((old, new)))
+def test_what_leaves_the_picture_alone_is_plain(fork, changes):
+    assert read_plain(fork(*((changes,) if isinstance(changes[0], str) else changes)))
 
 
 def test_values_in_further_columns_that_a_rasterizer_takes_make_another_picture(fork):
@@ -425,17 +449,12 @@ def test_a_mask_of_which_a_rasterizer_gives_a_picture_scales_no_opacities(fork, 
     assert ("masks that scale the opacities" in str(reasons)) == bool(reasons) == (seen == "depth")
 
 
-def test_opacities_that_are_dropped_as_training_goes_on_are_no_others(fork):
-    given = ("override_color=None):", "override_color=None, iteration=None):")
-    trains = ("scene.save(", "render(training=True, iteration=iteration), scene.save(")
-    assert read_plain(fork(given, trains, ("* pc.dropout", "* dropped(iteration / 1000)")))
-
-
-@pytest.mark.parametrize("usual", [1.0, 0.5])
+@pytest.mark.parametrize("usual", [1.0, 0.5, 2.0])
 def test_scales_times_what_is_1_if_not_given_are_no_others(fork, usual):
     scaled = ("pc.get_scaling, pc", "pc.get_scaling * scaling_modifier, pc")
     given = ("override_color=None):", f"override_color=None, scaling_modifier={usual}):")
-    assert bool(read_plain(fork(scaled, given))) == (usual == 1)
+    reasons = read_plain(fork(scaled, given)).reasons
+    assert ("scales otherwise than" in str(reasons)) == bool(reasons) == (usual != 1)
 
 
 def test_covariances_to_which_something_is_added_are_others(fork):
@@ -447,27 +466,6 @@ def test_covariances_to_which_something_is_added_are_others(fork):
     assert read_plain(fork(*changes))
     found = read_plain(fork(*changes, ("    def construct", f"{sized}    def construct"))).reasons
     assert "get_covariance makes other covariances" in str(found)
-
-
-def test_values_that_a_drawing_function_is_given_may_be_those_of_a_ply(fork):
-    given = ("override_color=None):", "override_color=None, dc=None):")
-    joined = "    both = torch.cat([dc, shs], dim=1)\n    drawn"
-    assert read_plain(fork(given, (END, GSPLAT.format("both").replace("    drawn", joined))))
-
-
-def test_scales_times_a_factor_of_one_are_no_others(fork):
-    taken = ("override_color=None):", "override_color=None, scaling_modifier=1.0):")
-    scaled = "pc.get_scaling * scaling_modifier, pc"
-    assert read_plain(fork(taken, ("pc.get_scaling, pc", scaled)))
-    other = (taken[0], taken[1].replace("1.0", "2.0"))
-    assert "scales otherwise than" in str(read_plain(fork(other, ("pc.get_scaling, pc", scaled))))
-
-
-def test_positions_that_stand_still_are_no_others(fork):
-    stands = "        self._xyz = nn.Parameter(points.requires_grad_(False))\n"
-    trained = ("{'params': [], 'name': 'f_dc'}", "{'params': [self._opacity]}")
-    at = "        scales = torch.log(distances)"
-    assert read_plain(fork(trained, (at, stands + at)))
 
 
 @pytest.mark.parametrize("value", ["self.get_opacity", "self.get_opacity * self.rain"])
@@ -570,10 +568,6 @@ def test_a_picture_of_several_models_is_not_that_of_one_ply(fork, made, reason):
     assert (reason in reasons[0]) if reason else not reasons
 
 
-def test_a_scene_by_another_name_is_saved_too(fork):
-    assert read_plain(fork(("scene.save(", "scene_static.save(")))
-
-
 def test_the_drawing_that_a_training_script_names_decides(fork):
     drawn = RENDER.replace("def render(", "def render_all(").replace("pc.get_xyz", "pc.net(t)")
     both = (RENDER, RENDER + drawn)
@@ -589,16 +583,26 @@ def test_the_drawing_that_returns_a_picture_decides(fork, tmp_path):
     assert read_plain(repo)
 
 
-def test_a_script_that_draws_by_itself_is_not_read_without_a_model(tmp_path):
-    (tmp_path / "train.py").write_text(RENDER.replace("pc.get_xyz", "pc.net(t)"))
-    assert judged(HostRepo(tmp_path)).reason == "no model of this family that saves a PLY was found"
-
-
-def test_a_model_that_is_no_python_is_said_to_be(tmp_path):
+@pytest.mark.parametrize(
+    ("file", "text", "reason"),
+    [
+        ("train.py", RENDER.replace("pc.get_xyz", "pc.net(t)"), NO_MODEL),  # it draws by itself
+        (
+            "scene/__init__.py",
+            "class S:\n    def save_ply(self): self.model.save_ply()\n",
+            NO_MODEL,
+        ),
+        (
+            "scene/gaussian_model.py",
+            "<<<<<<< HEAD\n",
+            "its scene/gaussian_model.py is no valid Python",
+        ),
+    ],
+)
+def test_without_a_model_nothing_is_read(tmp_path, file, text, reason):
     (tmp_path / "scene").mkdir()
-    (tmp_path / "scene" / "gaussian_model.py").write_text("<<<<<<< HEAD\n")
-    reason = judged(HostRepo(tmp_path)).reason
-    assert reason == "its scene/gaussian_model.py is no valid Python"
+    (tmp_path / file).write_text(text)
+    assert judged(HostRepo(tmp_path)).reason == reason
 
 
 def test_of_several_folders_one_with_a_plain_ply_decides(fork, tmp_path):
@@ -686,15 +690,6 @@ def test_a_ply_of_a_model_that_was_not_read_is_not_plain(fork):
     trains = "\nfrom mesh import MeshModel\nmodel = MeshModel(3)\n\ndef report("
     found = "its PLY was not read: train.py trains MeshModel, not GaussianModel"
     assert judged(fork(("\ndef report(", trains))).reason == found
-
-
-def test_a_class_that_lists_no_columns_is_no_model(fork, tmp_path):
-    fork()
-    scene = tmp_path / "scene"
-    (scene / "gaussian_model.py").unlink()
-    saving = "class Scene:\n    def save_ply(self, path): self.gaussians.save_ply(path)\n"
-    (scene / "__init__.py").write_text(saving)
-    assert judged(HostRepo(tmp_path)).reason == "no model of this family that saves a PLY was found"
 
 
 def test_a_model_that_is_not_in_the_checkout_is_looked_for_in_its_submodules(tmp_path):
