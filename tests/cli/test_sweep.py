@@ -120,8 +120,7 @@ def test_what_is_in_the_background_is_waited_for_and_a_killed_one_is_told(photog
 
 def test_a_temporary_folder_may_forbid_programs(tmp_path, monkeypatch):
     monkeypatch.setattr("os.access", lambda path, mode: mode != os.X_OK)
-    script = script_of(tmp_path, "python train.py")
-    fails("run", "--", script, says="Set TMPDIR", code=2)
+    fails("run", "--", script_of(tmp_path, "python train.py"), says="Set TMPDIR")
 
 
 def test_options_of_the_interpreter_are_lost_only_where_it_is_ours(tmp_path, caplog):
@@ -157,15 +156,10 @@ def test_what_would_start_another_python_is_refused_before_anything(line, tmp_pa
     assert not (tmp_path / "ran").exists()
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "found"),
-    [
-        ('"python train', 'sys.executable + " train', "sys.executable"),
-        ('"python train', '"torchrun train', "torchrun train.py"),
-    ],
-)
-def test_so_is_it_in_a_script_of_python(old, new, found, tmp_path):
-    fails("run", "--", script_of(tmp_path, FULL_EVAL.replace(old, new), "all.py"), says=found)
+@pytest.mark.parametrize("starts", ['sys.executable + " train', '"torchrun train'])
+def test_so_is_it_in_a_script_of_python(starts, tmp_path):
+    script = script_of(tmp_path, FULL_EVAL.replace('"python train', starts), "all.py")
+    fails("run", "--", script, says=starts.strip('"').split(" + ")[0])
 
 
 @pytest.mark.parametrize(

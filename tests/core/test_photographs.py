@@ -23,8 +23,16 @@ HOST = HostRepo(Path(work.__file__).with_name("host"))
 SIDES = st.integers(1, 6000)
 
 
-def command(*words):
-    return Vanilla3DGS().photographs(HOST, ["-s", "scene", "--eval", *words])
+def command(*words, host=HOST):
+    """What is known of a command's photographs; of a changed host, if its folder is given."""
+    repo = host if host is HOST else HostRepo(host)
+    return Vanilla3DGS().photographs(repo, ["-s", "scene", "--eval", *words])
+
+
+@pytest.fixture
+def own(tmp_path):
+    """A copy of the host, to be changed."""
+    return shutil.copytree(HOST.root, tmp_path, dirs_exist_ok=True)
 
 
 @pytest.mark.parametrize(
@@ -62,22 +70,22 @@ def test_a_size_that_makes_no_sense_is_refused(value):
         command("-r", str(value))
 
 
-def test_which_numbers_are_divisors_is_read_from_the_source(tmp_path):
-    file = tmp_path / "utils" / "camera_utils.py"
-    file.parent.mkdir()
-    file.write_text("def loadCam(args):\n    if args.resolution in [1, 16]: 1600\n")
-    assert resolution(HostRepo(tmp_path), 16) == Resolution(divide=16)
-    assert resolution(HostRepo(tmp_path), 8) == Resolution(width=8)
-
-
 @pytest.mark.parametrize(
-    "source", [None, "", "def loadCam(args):\n    if args.resolution in [1, 2]: 1200\n"]
+    ("source", "size"),
+    [
+        ("def loadCam(args):\n    if args.resolution in [1, 2]: 1600\n", Resolution(divide=2)),
+        ("def loadCam(args):\n    if args.resolution in [1, 16]: 1600\n", Resolution(width=2)),
+        ("def loadCam(args):\n    if args.resolution in [1, 2]: 1200\n", None),
+        *(("", None), (None, None)),
+    ],
 )
-def test_another_way_of_choosing_the_size_is_refused(tmp_path, source):
-    file = tmp_path / "utils" / "camera_utils.py"
-    file.parent.mkdir()
+def test_which_numbers_are_divisors_is_read_from_the_source(tmp_path, source, size):
+    (tmp_path / "utils").mkdir()
     if source is not None:
-        file.write_text(source)
+        (tmp_path / "utils/camera_utils.py").write_text(source)
+    if size:
+        assert resolution(HostRepo(tmp_path), 2) == size
+        return
     with pytest.raises(NotComparedError, match=r"utils/camera_utils\.py|do not know"):
         resolution(HostRepo(tmp_path), 2)
 
@@ -89,30 +97,24 @@ def test_folder_background_and_images_are_the_commands():
     assert not command().white_background
 
 
-def test_what_a_command_leaves_out_is_the_hosts_own(tmp_path):
-    shutil.copytree(HOST.root, tmp_path, dirs_exist_ok=True)
-    source = tmp_path / "arguments" / "__init__.py"
-    for name, usual, own in (
+def test_what_a_command_leaves_out_is_the_hosts_own(own):
+    for name, usual, other in (
         ("_images", '"images"', '"images_8"'),
         ("_white_background", "False", "True"),
         ("eval", "False", "True"),
     ):
-        edit(source, f"self.{name} = {usual}", f"self.{name} = {own}")
-    read = Vanilla3DGS().photographs(HostRepo(tmp_path), ["-s", "scene"])
+        edit(own / "arguments/__init__.py", f"self.{name} = {usual}", f"self.{name} = {other}")
+    read = Vanilla3DGS().photographs(HostRepo(own), ["-s", "scene"])
     assert (read.images, read.white_background, read.held_out) == ("images_8", True, True)
-    named = Vanilla3DGS().photographs(HostRepo(tmp_path), ["-s", "scene", "-i", "images"])
-    assert named.images == "images"
+    assert command("-i", "images", host=own).images == "images"
 
 
-def test_the_middle_is_the_principal_point_of_a_host_that_reads_no_other(tmp_path):
+def test_the_middle_is_the_principal_point_of_a_host_that_reads_no_other(own):
     assert command().centred
-    shutil.copytree(HOST.root, tmp_path, dirs_exist_ok=True)
-    source = tmp_path / "scene" / "cameras.py"
     usual = "projection = getProjectionMatrix(znear, zfar, fovX, fovY"
-    source.write_text(f"{usual}).transpose(0, 1).cuda()\n")
-    assert Vanilla3DGS().photographs(HostRepo(tmp_path), ["-s", "scene", "--eval"]).centred
-    source.write_text(f"{usual}, cx=cx).transpose(0, 1).cuda()\n")
-    assert not Vanilla3DGS().photographs(HostRepo(tmp_path), ["-s", "scene", "--eval"]).centred
+    for more in ("", ", cx=cx"):
+        (own / "scene/cameras.py").write_text(f"{usual}{more}).transpose(0, 1).cuda()\n")
+        assert bool(command(host=own).centred) == (not more)
 
 
 @pytest.mark.parametrize(
@@ -123,14 +125,12 @@ def test_the_middle_is_the_principal_point_of_a_host_that_reads_no_other(tmp_pat
         ("if resized_image_rgb.shape[0] == 4: loaded_mask = resized_image_rgb[3:4]", False, False),
     ],
 )
-def test_alpha_is_dropped_where_the_host_drops_it(tmp_path, load, colmap, blender):
-    shutil.copytree(HOST.root, tmp_path, dirs_exist_ok=True)
-    with (tmp_path / "utils" / "camera_utils.py").open("a") as source:
+def test_alpha_is_dropped_where_the_host_drops_it(own, load, colmap, blender):
+    with (own / "utils/camera_utils.py").open("a") as source:
         source.write(f"\n\ndef own(cam_info, resized_image_rgb):\n    {load}\n")
-    words = ["-s", str(tmp_path), "--eval"]
-    assert Vanilla3DGS().photographs(HostRepo(tmp_path), words).opaque == colmap
-    (tmp_path / "transforms_train.json").touch()
-    assert Vanilla3DGS().photographs(HostRepo(tmp_path), words).opaque == blender
+    assert command("-s", str(own), host=own).opaque == colmap
+    (own / "transforms_train.json").touch()
+    assert command("-s", str(own), host=own).opaque == blender
 
 
 def test_a_command_that_holds_nothing_out_learns_from_all(tmp_path):
