@@ -59,11 +59,10 @@ def state(*, learn=True, **options) -> SessionState:
     return SessionState(Adapter(), repo, Plugins(), learn=learn, **options)
 
 
-def follow(session: SessionState, count: int = 6) -> tuple[Model, ModelState]:
-    """A model that the session knows, each row with a threshold and moments of its own."""
-    model = Model(count)
-    store = ThresholdStore(count)
-    numbers = torch.arange(float(count))
+def follow(session: SessionState) -> tuple[Model, ModelState]:
+    """Six rows that the session knows, each with a threshold and moments of its own."""
+    model, store = Model(6), ThresholdStore(6)
+    numbers = torch.arange(6.0)
     moments = {"exp_avg": 1 + numbers, "exp_avg_sq": 1 + numbers}
     store.load_state_dict({"logits": -3 + numbers / 8, **moments, "adam_step": 2.0, "steps": 2})
     known = session.models[model] = ModelState(store)

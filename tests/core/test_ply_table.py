@@ -11,8 +11,8 @@ from fragprune_plugins.files.reading import Reading
 ROWS = np.array([[1, 2], [3, 4], [5, 6]], dtype=np.float64)
 
 
-def table(path, kind, body, *before, count=3, properties=("double x", "double y")):
-    lines = [b"ply", b"format " + kind + b" 1.0", *before, b"element vertex %d" % count]
+def table(path, kind, body, *before, properties=("double x", "double y")):
+    lines = [b"ply", b"format " + kind + b" 1.0", *before, b"element vertex 3"]
     lines += [b"property " + each.encode() for each in properties]
     path.write_bytes(b"\n".join([*lines, b"end_header\n"]) + body)
     with open(path, "rb") as file:

@@ -98,9 +98,9 @@ def test_without_opencv_a_bent_lens_is_refused_with_what_to_install(monkeypatch)
         lens("radial").camera(EYE, ORIGIN)
 
 
-def write_photographs(folder, of: Lens, size=(WIDTH, HEIGHT)):
+def write_photographs(folder, of: Lens):
     folder.mkdir(parents=True)
-    photograph = Image.fromarray(bent(of)).resize(size)
+    photograph = Image.fromarray(bent(of))
     for i in range(9):
         photograph.save(folder / f"view{i}.png")
 

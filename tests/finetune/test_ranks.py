@@ -21,8 +21,6 @@ from fragprune_plugins.workbench.finetune import loop, processes
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
 from fragprune_plugins.workbench.ranks import Ranks, fingerprint, joined, launched, should_print
 
-ALL = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
-
 
 def learned(model, dataset, settings, ranks=None, moving=()):
     """Everything that a fine-tuning leaves, as plain values."""

@@ -16,7 +16,6 @@ from fragprune_plugins.learning.schedule import Schedule, Settings
 from fragprune_plugins.workbench.finetune import loop, resuming
 from fragprune_plugins.workbench.finetune.resuming import Checkpoints
 
-ALL = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")
 STEPS = 12
 
 

@@ -20,9 +20,9 @@ def logit(opacity):
     return torch.logit(torch.tensor(opacity)).item()
 
 
-def with_strays(seed=0, count=60):
+def with_strays(seed=0):
     """A model some of whose Gaussians are faint, out of every picture, or hidden by others."""
-    model = tiny.random_model(count, seed=seed)
+    model = tiny.random_model(seed=seed)
     xyz, opacity, scaling = model.xyz.clone(), model.opacity.clone(), model.scaling.clone()
     opacity[:10] = logit(0.003)  # faint
     xyz[10:20, 1] += 50  # out of the picture
