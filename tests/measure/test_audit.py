@@ -1,4 +1,4 @@
-"""What a splat costs and what of it nobody sees, against pictures that were drawn without it."""
+"""What a splat costs and what of it nobody sees, from where it is looked at, in other viewers, too."""
 
 import math
 from dataclasses import replace
@@ -9,7 +9,7 @@ from finetune import tiny
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fragprune_plugins import RasterInputs, engine_for
+from fragprune_plugins import Model, RasterInputs, engine_for, look_at
 from fragprune_plugins.engines.fragments import fragments
 from fragprune_plugins.engines.reference import ReferenceEngine
 from fragprune_plugins.workbench.audit.audit import (
@@ -22,6 +22,8 @@ from fragprune_plugins.workbench.audit.audit import (
     audit,
     weigh,
 )
+from fragprune_plugins.workbench.audit.placing import place
+from fragprune_plugins.workbench.figures.extents import CUTS, SQRT8, VIEWERS, Extent, Viewer, shaded
 from reference_renderer.render import Blended
 
 ENGINE = engine_for("auto", "cpu")
@@ -184,3 +186,162 @@ def test_the_size_of_the_timed_frames_is_said_smallest_and_largest():
         named = [(str(number), view) for number, view in enumerate(views)]
         figures, _ = audit(tiny.random_model(5), named, engine=ENGINE, tiles=1, repeats=1)
         assert figures["frame_size"] == size
+
+
+BY_NAME = {viewer.names.split(",")[0]: viewer for viewer in VIEWERS}
+
+
+def one(opacity=0.5, size=0.2):
+    """A round Gaussian in the middle of the picture, and its variance there, pixels^2."""
+    splat = tiny.round_ones(torch.zeros(1, 3), size, opacity)
+    view = look_at((0, 0, -4), (0, 0, 0), width=160, height=160, fov_y=53.13)
+    focal = 160 / (2 * view.tan_fov_y)
+    return RasterInputs(view, splat.splats()), (focal * size / 4) ** 2 + 0.3
+
+
+@pytest.mark.parametrize(
+    ("viewer", "opacity", "squared"),
+    [
+        *(("antimatter15/splat", opacity, 8.0) for opacity in (0.5, 0.02)),  # however faint
+        ("three.js GaussianSplatMesh", 0.02, 4.0),
+        *(("PlayCanvas", 0.5, 8.0), ("PlayCanvas", 0.002, 0.0)),
+        ("PlayCanvas", 0.05, 2 * math.log(255 * 0.05)),
+    ],
+)
+def test_a_quad_around_one_gaussian(viewer, opacity, squared):
+    inputs, variance = one(opacity)
+    pixels = shaded(ReferenceEngine(), inputs, BY_NAME[viewer]) * 160 * 160
+    side = 2 * math.sqrt(squared * variance)
+    assert pixels == pytest.approx(side**2, rel=0.03, abs=2)  # an ellipse's pixels are counted
+
+
+def test_tiles_of_the_host_are_those_of_the_oracle():
+    splats = tiny.random_model(count=200).splats()
+    view = look_at((0, 0, -2.5), (0, 0, 0), width=96, height=64)
+    inputs = RasterInputs(view, splats, planes=())
+    out = ReferenceEngine().rasterize(inputs, None)
+    host = BY_NAME["3DGS reference (CUDA)"]
+    assert shaded(ReferenceEngine(), inputs, host) == pytest.approx(out.evaluated_per_pixel)
+
+
+def test_tiles_of_a_box_that_follows_the_opacity():
+    inputs, variance = one(0.05, size=0.3)
+    half = math.ceil(math.sqrt(2 * math.log(255 * 0.05) * variance))
+    first, last = math.floor((79.5 - half) / 16), math.ceil((79.5 + half) / 16)
+    expected = (last - first) ** 2 * 256 / 160**2
+    assert shaded(ReferenceEngine(), inputs, BY_NAME["gsplat 1.5"]) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("extent", [*CUTS, SQRT8], ids=lambda extent: extent.name)
+def test_thresholds_end_where_the_rule_does(extent):
+    opacities = torch.tensor([0.004, 0.02, 0.3, 0.9], dtype=torch.float64)
+    thresholds = extent.thresholds(opacities)
+    assert ((thresholds > 0) & (thresholds <= 1)).all()
+    kept = extent.squared(opacities) >= 0
+    at_rim = thresholds[kept]
+    assert torch.allclose(-2 * at_rim.log(), extent.squared(opacities)[kept])
+    if extent.alpha:
+        assert (at_rim * opacities[kept] >= extent.alpha * (1 - 1e-9)).all()
+
+
+def test_a_smaller_extent_never_shades_more():
+    inputs = RasterInputs(tiny.cameras()[0].view(), tiny.random_model().splats())
+    for shape in ("quad", "square", "box"):
+        pixels = [
+            shaded(ReferenceEngine(), inputs, Viewer("", Extent("", sigmas), shape))
+            for sigmas in (1.0, 2.0, math.sqrt(8), 3.0)
+        ]
+        assert pixels == sorted(pixels)
+        assert pixels[0] < pixels[-1]
+
+
+def box(count, half, seed=0):
+    """Points on the six sides of a box."""
+    stream = torch.Generator().manual_seed(seed)
+    points = 2 * torch.rand(count, 3, generator=stream) - 1
+    rows = torch.arange(count)
+    points[rows, rows % 3] = points[rows, rows % 3].sign()
+    return points * torch.tensor(half)
+
+
+def room(seed=0):
+    """Walls, a ceiling, a floor, and a table in a corner."""
+    table = box(400, (0.6, 0.4, 0.6), seed) + torch.tensor([1.5, 1.0, -1.0])
+    return tiny.round_ones(torch.cat([box(4000, (3.0, 1.5, 2.5), seed), table]), 0.12)
+
+
+def thing(seed=0):
+    """A solid object on a round plate."""
+    stream = torch.Generator().manual_seed(seed)
+    body = torch.randn(2500, 3, generator=stream)
+    body *= (torch.rand(2500, 1, generator=stream) ** (1 / 3)) / body.norm(dim=1, keepdim=True)
+    turn, reach = 2 * math.pi * torch.rand(1500, generator=stream), 2.0
+    radius = reach * torch.rand(1500, generator=stream).sqrt()
+    plate = torch.stack([radius * turn.cos(), torch.full((1500,), 1.0), radius * turn.sin()], 1)
+    return tiny.round_ones(torch.cat([body, plate]), 0.1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_room_is_looked_at_from_inside(seed):
+    model = room(seed)
+    placed = place(model, 8, ENGINE)
+    assert placed.side == "inside"
+    assert placed.enclosed > 0.6
+    assert f"{placed.enclosed:.0%} of all directions" in placed.why
+    for _, view in placed.views:
+        assert (view.campos.abs() < torch.tensor([3.0, 1.5, 2.5])).all()
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_what_is_shown_first_is_the_front_and_from_above(side):
+    """A board, painted on one side and plain on the other; y is down."""
+    across = torch.linspace(-1, 1, 40)
+    board = torch.cartesian_prod(torch.tensor([-0.3, 0.3]), across, across)
+    model = tiny.round_ones(board, 0.04)
+    squares = ((board[:, 1:] * 4).floor().sum(dim=1) % 2)[:, None, None].expand(-1, 1, 3)
+    model.f_dc[:] = torch.where(board[:, :1, None] * side > 0, 3 * squares - 1.5, 0.0)
+    views = [view for _, view in place(model, 12, ENGINE, side="orbit", divide=10).views]
+    assert side * float(views[0].campos[0]) > 0
+    assert [bool(view.campos[1] < 0) for view in views] == 6 * [True] + 6 * [False]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_object_is_looked_at_from_outside(seed):
+    placed = place(thing(seed), 8, ENGINE)
+    assert placed.side == "orbit"
+    assert placed.enclosed < 0.5
+    for _, view in placed.views:
+        assert view.campos.norm() > 2
+
+
+def test_nobody_looks_out_of_the_open_side():
+    whole = room()
+    model = whole.keep(whole.xyz[:, 0] < 2.9)
+    placed = place(model, 6, ENGINE, side="inside", divide=10)
+    for _, view in placed.views:
+        ahead = view.viewmatrix[:3, 2]
+        assert float(ahead[0]) < 0.8
+    assert len(placed.views) == 6
+
+
+def test_thin_haze_all_around_is_no_air():
+    """Large faint Gaussians before every wall: no place is open, so cameras stay outside."""
+    walls, stream = room(), torch.Generator().manual_seed(1)
+    haze = tiny.round_ones(0.2 * torch.randn(60, 3, generator=stream), 1.0, 0.3)
+    both = {name: torch.cat([each, haze.tensors[name]]) for name, each in walls.tensors.items()}
+    assert place(Model(**both), 4, ENGINE).enclosed < place(walls, 4, ENGINE).enclosed
+
+
+@pytest.mark.parametrize(("model", "side"), [(room, "orbit"), (thing, "inside")])
+def test_it_can_be_asked_for(model, side):
+    placed = place(model(), 5, ENGINE, side=side, divide=4)
+    assert placed.side == side
+    assert placed.why == "As asked for."
+    assert {(view.width, view.height) for _, view in placed.views} == {(200, 200)}
+    assert len(placed.views) == 5
+
+
+def test_the_same_model_is_looked_at_from_the_same_places():
+    one, other = (place(room(), 6, ENGINE).views for _ in range(2))
+    for (_, view), (_, again) in zip(one, other, strict=True):
+        assert torch.equal(view.viewmatrix, again.viewmatrix)
