@@ -1,4 +1,4 @@
-"""What a splat costs and what of it nobody sees, from where it is looked at, in other viewers, too."""
+"""What a splat costs and what of it nobody sees, from where it is seen, and in other viewers."""
 
 import math
 from dataclasses import replace
