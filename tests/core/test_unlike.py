@@ -60,7 +60,7 @@ COMPARES, WEIGHS = "compares image with gt_image", "weighs what it compares,"
         ({"between": "behind, image = gaussians.adjusted(image)"}, COMPARES),
         ({"between": "image = image * torch.exp(gain)"}, COMPARES),
         ({"loss": "ssim(image * exposure, gt_image)"}, "compares image * exposure with gt_image"),
-        ({"loss": "l1_loss(image * m, gt_image * m)"}, "compares image * m with gt_image * m"),
+        ({"loss": "l1_loss(image * mask, gt_image)"}, "compares image * mask with gt_image"),
         ({"between": "gt_image = styled.pop(0)"}, COMPARES),
         ({"between": "gt_image = gt_image ** 2.2"}, COMPARES),
         ({"between": "image[:, seen] = 0"}, COMPARES),
