@@ -8,13 +8,20 @@ counts its steps from 0 again.
 
 from __future__ import annotations
 
+import ast
 from argparse import ArgumentParser
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from fragprune_graphdeco import GraphdecoAdapter, GraphdecoDialect, RasterizerCall, rasterizer_seam
+from fragprune_graphdeco import (
+    GraphdecoAdapter,
+    GraphdecoDialect,
+    RasterizerCall,
+    every,
+    rasterizer_seam,
+)
 from fragprune_plugins.adapting import (
     CommandLine,
     EngineError,
@@ -128,9 +135,18 @@ class GaussianSplatting(GraphdecoAdapter):
         return (*self.seams, self.noise) if repo.path(f"{MCMC}.trainer") else self.seams
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
-        """Check that this is the installed package, not a checkout of the same name."""
-        package = HostAdapter.fingerprint(self, repo)
-        return [*package, *super().fingerprint(repo)] if repo.package else package
+        """Check that this is the installed package, not a checkout of the same name; nor one of
+        which scripts import what the installed one lacks.
+        """
+        package, installed = HostAdapter.fingerprint(self, repo), HostRepo.installed(PACKAGE)
+        if repo.package:
+            return [*package, *super().fingerprint(repo)]
+        scripts = (repo.tree(each.stem) for each in sorted(repo.root.glob("*.py")))
+        taken = (each.module or "" for tree in scripts for each in every(tree, ast.ImportFrom))
+        for name in (each for each in taken if each.startswith(f"{PACKAGE}.")):
+            if installed and installed.path(name) is None:
+                return [Finding.error("own-host", repo.root, f"imports {name}", PACKAGE), *package]
+        return package
 
     def command_line(self, repo: HostRepo) -> CommandLine:
         """The flags of ``gaussian_splatting.train``, which MCMC's script shares."""

@@ -331,6 +331,8 @@ class Drawing:
         if blended:
             yield f"its rasterizer also takes {', '.join(blended)}", False
         for each in calls:
+            if "surfel" in each.package:
+                yield f"its Gaussians are flat, drawn by {each.package}", False
             if each.package == "an unknown package":
                 yield f"its rasterizer was not read ({each})", False
             grounds = [e for e in self._roots(each.given.get("bg")) if f"{self.model}." in e]
@@ -421,8 +423,9 @@ class Drawing:
 
     def _gives_back(self, name: str) -> bool:
         """Whether a function returns first what its first argument is, or begins with."""
-        function = self.repo.function(self.module, name)
-        kept = {each.arg for each in function.args.args[:1]} if function else set()
+        function = reading.definition_of(self.repo, self.module, name)[1] if name else None
+        plain = isinstance(function, ast.FunctionDef)
+        kept = {each.arg for each in function.args.args[:1]} if plain else set()  # type: ignore[union-attr]
         for target, value in assigned(function):
             if getattr(value, "id", "") in kept and isinstance(target, ast.Tuple):
                 kept |= {getattr(target.elts[0], "id", "")}
@@ -437,6 +440,10 @@ class Drawing:
         given, name, at = self.arguments, self.function.name, self._at(self.function)
         if others := self._others(given.get("shs")):
             yield f"{name} makes colours from {', '.join(others[:4])} ({at})", False
+        kinds = re.findall(r"features_(dc|rest)", " ".join(self._roots(given.get("shs"))))
+        if {*kinds} == {"rest"} and "dc" not in given:
+            rest = next(each for each in self._roots(given["shs"]) if "features_rest" in each)
+            yield f"{name} makes harmonics from {rest} alone ({at})", False
         for each in (*(e.given for e in read_calls(self.repo, self.module, name)), given):
             for argument, usual in _USUAL.items():
                 value = each.get(argument)

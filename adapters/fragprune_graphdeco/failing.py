@@ -56,7 +56,7 @@ def reasons(repo: HostRepo, scripts: tuple[str, ...]) -> tuple[str, ...]:
     if saver and saver.name != "save_ply" and ".save_ply(" not in text_of(saver):
         found.append(f"Scene.save writes its PLY by {saver.name}, which saves no thresholds")
     found += [*_left_out(repo, scripts), *_of_scene(repo), *_of_authors(repo)][:1]
-    found += [*panoramas(repo)][:1]
+    found += [*unlike_3dgs(repo)][:1]
     for script in scripts:
         module = module_of(script)
         tree, home = repo.tree(module), home_of(repo, module)
@@ -70,11 +70,12 @@ def reasons(repo: HostRepo, scripts: tuple[str, ...]) -> tuple[str, ...]:
         found += [*_broken(repo, module)][:1]
         found += [*_unbound(repo, module)][:1]
         found += (*_misfits(repo, module), *_absent(repo, module), *_own_options(repo, module))[:1]
-        found += [*_of_cameras(repo, module)][:1]
+        found += [*_of_cameras(repo, module), *_of_options(repo, module)][:1]
         found += [*_untyped(repo, module)][:1]
         found += [*_unmade(repo, module), *_into_none(repo, module)][:1]
         found += [f"{script} {why}" for why, asked in _ends(repo, module) if not asked][:1]
         found += [f"{script} draws by {each}" for each in _drawn_elsewhere(repo, module)][:1]
+        found += [f"{script} makes {each}" for each in _other_scenes(repo, module)][:1]
     return tuple(found)
 
 
@@ -239,10 +240,32 @@ def _of_scene(repo: HostRepo) -> Iterator[str]:
             yield f"its scene calls {name}, which GaussianModel lacks ({at})"
         if why := misfit(method, node, of_model=True):
             yield f"its scene's call of {name} {why}, which fails ({at})"
+        given = passed(node, repo.parameters(MODEL, f"GaussianModel.{name}") or ())
+        lists = {key for key, value in given.items() if text_of(value).startswith("scene_info.")}
+        for item in every(method, ast.Subscript):
+            between = isinstance(getattr(item.slice, "value", None), float)
+            if between and text_of(item.value) in lists:
+                yield f"its model takes {text_of(item)} of a list ({at})"
 
 
-def panoramas(repo: HostRepo) -> Iterator[str]:
-    """Cameras that a reader makes with an angle that no plane can show: panoramas."""
+def _other_scenes(repo: HostRepo, module: str) -> Iterator[str]:
+    """Scenes that a script makes, and that are made without the ``__init__`` of ``Scene``."""
+    functions = learning(repo.tree(module))
+    for call in (each for function in functions for each in every(function, ast.Call)):
+        _, made = definition_of(repo, module, getattr(call.func, "id", ""))
+        own = [n for n in getattr(made, "body", ()) if getattr(n, "name", "") == "__init__"]
+        name, bases = getattr(made, "name", ""), map(text_of, getattr(made, "bases", ()))
+        calls = any("super().__init__(" in text_of(each) for each in own)
+        if own and not calls and name != "Scene" and "Scene" in " ".join([name, *bases]):
+            yield f"{name}, no Scene ({repo.at(module, call.lineno)})"
+
+
+def unlike_3dgs(repo: HostRepo) -> Iterator[str]:
+    """Panoramas, by an angle of a camera that no plane can show; and a PLY of more channels."""
+    for text in every(repo.tree(MODEL), ast.Constant):
+        if text.value == "f_dc_3":
+            at = repo.at(MODEL, text.lineno)
+            yield f"its PLY may have a further channel, f_dc_3 ({at})"
     module = "scene.dataset_readers"
     words = [each for call in every(repo.tree(module), ast.Call) for each in call.keywords]
     for each in (each for each in words if each.arg in ("FovX", "FovY")):
@@ -253,12 +276,22 @@ def panoramas(repo: HostRepo) -> Iterator[str]:
 
 
 def _of_authors(repo: HostRepo) -> Iterator[str]:
-    """Files that the scene loads by a path of its author's, whatever its command says."""
-    made = repo.function("scene", "Scene.__init__")
-    for node in getattr(made, "body", ()):
-        value = getattr(node.value, "value", "") if isinstance(node, ast.Assign) else ""
-        if re.fullmatch(r"(/|[A-Z]:)\S+\.\w+", str(value)):
-            yield f"its scene loads {value} ({repo.at('scene', node.lineno)})"
+    """Files that the scene, or the model as it is made, loads by a path of its author's, whatever
+    the command says.
+    """
+    made = [("scene", "scene", "Scene.__init__")]
+    made.append(("model", MODEL, "GaussianModel.create_from_pcd"))
+    for what, module, name in made:  # it grows
+        body = getattr(repo.function(module, name), "body", ())
+        for node in (each for each in body if isinstance(each, ast.Assign | ast.Expr)):
+            calls = every(node, ast.Call)
+            for value in (node.value, *(arg for each in calls for arg in each.args[:1])):
+                if re.fullmatch(r"(/|[A-Z]:)\S+\.\w+", str(getattr(value, "value", ""))):
+                    at = repo.at(module, node.lineno)
+                    yield f"its {what} loads {value.value} ({at})"  # type: ignore[attr-defined]
+            names = (text_of(each.func).partition("self.")[2] for each in calls)
+            inner = [(what, module, f"{name.partition('.')[0]}.{each}") for each in names]
+            made += [each for each in inner if each not in made]
 
 
 _CAMERA = re.compile(r"viewpoint(_?cam(era)?)?")
@@ -286,6 +319,28 @@ def _of_cameras(repo: HostRepo, module: str) -> Iterator[str]:
         given = rf"(?<!self)\.{name}\b[^=(),\n]*=(?!=)|['\"]{name}['\"]"
         if of_camera and f"self.{name}" not in own and not re.search(given, texts):
             yield f"reads {name} of a camera, which has none ({repo.at(module, node.lineno)})"
+
+
+def _of_options(repo: HostRepo, module: str) -> Iterator[str]:
+    """Options that a script reads of what a group extracts, and that the group does not have."""
+    tree, gone = repo.tree(module), _perhaps(repo, module)
+    makes = {text_of(to): text_of(getattr(made, "func", None)) for to, made in assigned(tree)}
+    whole = "in vars(self)" in text_of(repo.function("arguments", "ParamGroup.extract"))
+    for function in learning(tree) if whole else ():
+        takes = [each.arg for each in function.args.args]
+        calls = repo.calls(module, function.name)
+        for name, value in (each for call in calls for each in passed(call, takes).items()):
+            group = makes.get(text_of(value).partition(".extract(")[0], "")
+            own = every(repo.definition("arguments", group) if group else None, ast.Attribute)
+            known = {each.attr.removeprefix("_") for each in own}
+            for node in (e for e in every(function, ast.Attribute) if e not in gone):
+                option, read = f"{name}.{node.attr}", text_of(node)
+                texts = (text_of(tree), *texts_of(repo).values())
+                given = any(re.search(rf"\b{option} = |(set|has)attr\({name}\b", t) for t in texts)
+                given |= name in {text_of(to) for to, _ in assigned(function)}
+                if known and read == option and node.attr not in known and not given:
+                    at = repo.at(module, node.lineno)
+                    yield f"reads {option}, and {group} has no such option ({at})"
 
 
 def _lengths(

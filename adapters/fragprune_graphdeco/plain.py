@@ -62,7 +62,7 @@ def read_plain(repo: HostRepo) -> Plain:
         *getters,
         *_of_columns(model),
         *(() if flat else _of_kernel(repo)),
-        *failing.panoramas(repo),
+        *failing.unlike_3dgs(repo),
         *drawn,
         *saved.values(model),
         *saved.activations(model),
@@ -153,7 +153,7 @@ def _of_columns(model: ModelClass) -> Iterator[str]:
     (listed, names), at = saved.columns(model), model.at(saved.LISTS)
     if missing := [each for each in saved.COLUMNS if not any(n.startswith(each) for n in names)]:
         yield f"its PLY lacks the columns {', '.join(missing)} ({at})"
-    if listed is not None and listed.name == saved.LISTS:
+    if listed not in (None, model.saver):
         for each in names:
             if (says := change_of(each)) and each not in _seen(model.repo):
                 yield f"its PLY also holds {each}, {says} ({at})"

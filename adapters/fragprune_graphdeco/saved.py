@@ -25,7 +25,10 @@ LISTS = "construct_list_of_attributes"
 
 def columns(model: ModelClass) -> tuple[Function | None, list[str]]:
     """The function that lists a PLY's columns, and their names without numbers."""
-    listed = model.method(LISTS) or model.saver
+    calls = (text_of(each.func) for each in every(model.saver, ast.Call))
+    asked = (model.method(each[5:]) for each in calls if each.startswith("self."))
+    lists = (each for each in asked if "'opacity'" in text_of(each))
+    listed = model.method(LISTS) or next(lists, model.saver)
     names = dict.fromkeys(
         re.sub(r"_?(\{\})?\d*$", "", node.value)
         for node in every(listed, ast.Constant)

@@ -1218,6 +1218,114 @@ def test_a_scene_that_makes_its_model_in_vain_is_refused(tmp_path, body, found):
     assert not found or "(scene/__init__.py:6)" in str(errors(repo))
 
 
+@pytest.mark.parametrize(
+    ("called", "loaded", "runs"),
+    [
+        ("self.sized()", "np.load('C:/mine/sizes.npy')", False),
+        ("self.sized()", "np.load(self.path + '/sizes.npy')", True),
+        ("self.sized()", "np.load('sizes.npy')", True),
+        ("if self.path: self.sized()", "np.load('C:/mine/sizes.npy')", True),
+    ],
+)
+def test_a_model_that_loads_a_file_of_its_authors_as_it_is_made_is_refused(
+    tmp_path, called, loaded, runs
+):
+    made = f"    def create_from_pcd(self, pcd):\n        {called}\n\n"
+    made += f"    def sized(self):\n        sizes = {loaded}\n\n    def training_setup"
+    found = errors(fork(tmp_path, ("    def training_setup", made)))
+    said = "its model loads C:/mine/sizes.npy (scene/gaussian_model.py:"
+    assert (said in str(found)) == bool(found) == (not runs)
+
+
+@pytest.mark.parametrize(
+    ("taken", "given", "runs"),
+    [
+        ("views[1.0]", "scene_info.train_cameras", False),
+        ("views[1.0]", "self.train_cameras", True),
+        ("views[0]", "scene_info.train_cameras", True),
+    ],
+)
+def test_a_list_has_no_items_between_its_items(tmp_path, taken, given, runs):
+    made = f"    def create_from_pcd(self, views):\n        first = {taken}\n\n    def capture"
+    repo = fork(tmp_path, ("    def capture", made))
+    scene = tmp_path / "scene/__init__.py"
+    made = "def __init__(self, args, gaussians):\n        self.gaussians.create_from_pcd({})\n"
+    text = scene.read_text().replace("def __init__(self, args, gaussians): ...\n", made)
+    scene.write_text(text.format(given))
+    said = f"its model takes {taken} of a list (scene/__init__.py:6)"
+    assert errors(repo) == [] if runs else said in str(errors(repo))
+
+
+GROUP = """class ParamGroup:
+    def extract(self, args):
+        group = GroupParams()
+        for arg in vars(args).items():
+            if arg[0] in vars(self) or ("_" + arg[0]) in vars(self):
+                setattr(group, arg[0], arg[1])
+        return group
+
+
+class OptimizationParams(ParamGroup):
+    def __init__(self, parser):
+        self.iterations = 30
+        self._rate = 1.0
+
+    def extract(self, args):
+        g = super().extract(args)
+        g.densify_until_iter = 15
+        return g
+"""
+
+
+@pytest.mark.parametrize(
+    ("read", "runs"),
+    [
+        ("opt.folder", False),
+        ("opt.rate", True),
+        ("opt.densify_until_iter", True),
+        ("getattr(opt, 'folder', None)", True),
+        ("opt.folder if hasattr(opt, 'folder') else 0", True),
+        ("1\n    opt.folder = place\n    used = opt.folder", True),
+    ],
+)
+@pytest.mark.parametrize("extracted", [True, False])
+def test_a_group_of_options_has_no_others(tmp_path, read, runs, extracted):
+    uses = (
+        "    gaussians = GaussianModel(3)\n",
+        f"    used = {read}\n    gaussians = GaussianModel(3)\n",
+    )
+    given = "op.extract(args)" if extracted else "args"
+    starts = f"\nop = OptimizationParams(parser)\ntraining({given}, args.start)\n{PARSES}"
+    repo = fork(tmp_path, uses, (PARSES, starts))
+    (tmp_path / "arguments/__init__.py").write_text(GROUP)
+    found = "reads opt.folder, and OptimizationParams has no such option (train.py:"
+    assert errors(repo) == [] if runs or not extracted else found in str(errors(repo))
+
+
+@pytest.mark.parametrize(
+    ("made", "runs"),
+    [
+        ("def __init__(self, args, gaussians): ...", False),
+        ("def __init__(self, *args):\n        super().__init__(*args)", True),
+        ("def views(self): ...", True),
+    ],
+)
+def test_a_scene_of_its_own_is_none_that_seams_hear(tmp_path, made, runs):
+    changes = ("GaussianModel, Scene", "GaussianModel, Wide"), ("Scene(opt", "Wide(opt")
+    repo = fork(tmp_path, *changes)
+    with (tmp_path / "scene/__init__.py").open("a") as scene:
+        scene.write(f"\n\nclass Wide(Scene):\n    {made}\n")
+    assert errors(repo) == [] if runs else "makes Wide, no Scene (train.py:" in str(errors(repo))
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_a_model_of_four_channels_is_refused(tmp_path, channels):
+    reads = f"    def load_ply(self, path):\n        ply['f_dc_0'], ply['f_dc_{channels - 1}']"
+    found = errors(fork(tmp_path, ("    def load_ply(self, path): ...", reads)))
+    said = "its PLY may have a further channel, f_dc_3 (scene/gaussian_model.py:"
+    assert (said in str(found)) == bool(found) == (channels == 4)
+
+
 CAMERA = """class Camera(nn.Module):
     def __init__(self, image):
         self.{}image = image

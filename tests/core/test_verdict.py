@@ -352,6 +352,7 @@ def test_the_nearest_host_is_of_this_family(fork):
             "raster_settings=GaussianRasterizationSettings(scale_modifier=0.5)",
             "draws with scale_modifier=0.5, not 1.0",
         ),
+        ("shs = pc.get_features\n", "shs = pc._features_rest\n", "pc._features_rest alone"),
     ],
 )
 def test_one_whose_ply_is_not_the_picture_is_told_why(fork, old, new, reason):
@@ -432,6 +433,57 @@ STILL = (
 )
 def test_what_leaves_the_picture_alone_is_plain(fork, changes):
     assert read_plain(fork(*((changes,) if isinstance(changes[0], str) else changes)))
+
+
+def test_gaussians_that_a_rasterizer_of_surfels_draws_are_flat(fork):
+    made = ("settings=settings", "settings=GaussianRasterizationSettings(debug=False)")
+    names = "GaussianRasterizationSettings, GaussianRasterizer\n"
+    named = ("import GaussianRasterizer\n", f"import {names}")
+    assert read_plain(fork(made, named))
+    flat = ("diff_gaussian_rasterization", "diff_surfel_rasterization")
+    reasons = read_plain(fork(made, named, flat)).reasons
+    assert reasons == ("its Gaussians are flat, drawn by diff_surfel_rasterization",)
+
+
+@pytest.mark.parametrize(
+    ("drawn", "given", "kind"),
+    [
+        ("shs=shs, scales", "True", "never"),
+        ("shs=shs, scales", "opt.apart", "never"),
+        ("shs=shs, scales", "False", "finetune"),
+        ("dc=dc, shs=shs, scales", "True", "finetune"),
+    ],
+)
+def test_harmonics_without_the_first_are_others(fork, tmp_path, drawn, given, kind):
+    apart = (
+        "        shs = pc.get_features\n",
+        (
+            "        shs = pc.get_features\n"
+            "        if apart:\n            dc, shs = pc.get_features_dc, pc.get_features_rest\n"
+        ),
+    )
+    takes = ("override_color=None):", "override_color=None, apart=False):")
+    repo = fork(apart, takes, ("shs=shs, scales", drawn))
+    (tmp_path / "slam.py").write_text(f"package = render(camera, model, pipe, bg, apart={given})\n")
+    assert judged(repo).kind == kind
+
+
+def test_columns_may_be_listed_by_any_method_that_saves(fork):
+    listed = ("def construct_list_of_attributes(", "def columns_of(")
+    saves = (SAVED, SAVED + "        names = self.columns_of()\n")
+    assert read_plain(fork(listed, saves))
+    found = read_plain(fork(listed, saves, ('"opacity"]', '"opacity", "binding_0"]'))).reasons
+    assert "its PLY also holds binding" in str(found)
+
+
+@pytest.mark.parametrize("gives", ["result", "image, result[1]", "2 * image, result[1]"])
+def test_a_picture_that_a_module_beside_unpacks_is_the_same(fork, tmp_path, gives):
+    named = ("\n\ndef render", "\nfrom gaussian_renderer.compat import unpacked\n\n\ndef render")
+    taken = (CALLED, f"{CALLED}    image, radii = unpacked((image, radii))\n")
+    repo = fork(named, taken)
+    made = f"def unpacked(result):\n    image, radii = result\n    return {gives}\n"
+    (tmp_path / "gaussian_renderer/compat.py").write_text(made)
+    assert bool(read_plain(repo)) == ("2 *" not in gives)
 
 
 def test_values_in_further_columns_that_a_rasterizer_takes_make_another_picture(fork):

@@ -5,6 +5,7 @@ from miniatures.runs import edit
 from miniatures.skeletons import skeleton
 
 from fragprune_2dgs import SurfelSplatting
+from fragprune_gaussian_splatting import GaussianSplatting
 from fragprune_graphdeco.kernels import SPLAT, read_kernels, vendored
 from fragprune_plugins.adapting import Role, UsageError
 from fragprune_plugins.errors import UnknownHostError
@@ -334,6 +335,21 @@ def test_a_folder_of_the_same_name_as_an_installed_host_is_not_that_host(tmp_pat
     with pytest.raises(UnknownHostError):
         locate(HostRepo(tmp_path), [installed], above=False)
     assert looked_at == ["sharedname"]
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"), [("trainer.base", True), ("scene.gaussian_model", False)]
+)
+def test_a_package_without_the_modules_that_a_script_imports_is_not_meant(
+    tmp_path, monkeypatch, name, meant
+):
+    base = tmp_path / "site/gaussian_splatting/trainer/base.py"
+    base.parent.mkdir(parents=True)
+    base.touch()
+    monkeypatch.setattr(HostRepo, "installed", lambda each: HostRepo(tmp_path / "site", each))
+    (tmp_path / "slam.py").write_text(f"from gaussian_splatting.{name} import Base\n")
+    found = {each.code for each in GaussianSplatting().match(HostRepo(tmp_path)).errors}
+    assert ("own-host" not in found) == meant
 
 
 def test_a_drawing_of_other_values_than_the_adapter_states_is_refused(tmp_path):
