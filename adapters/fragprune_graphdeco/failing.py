@@ -331,16 +331,17 @@ def _of_options(repo: HostRepo, module: str) -> Iterator[str]:
         calls = repo.calls(module, function.name)
         for name, value in (each for call in calls for each in passed(call, takes).items()):
             group = makes.get(text_of(value).partition(".extract(")[0], "")
-            own = every(repo.definition("arguments", group) if group else None, ast.Attribute)
-            known = {each.attr.removeprefix("_") for each in own}
-            for node in (e for e in every(function, ast.Attribute) if e not in gone):
-                option, read = f"{name}.{node.attr}", text_of(node)
-                texts = (text_of(tree), *texts_of(repo).values())
-                given = any(re.search(rf"\b{option} = |(set|has)attr\({name}\b", t) for t in texts)
-                given |= name in {text_of(to) for to, _ in assigned(function)}
-                if known and read == option and node.attr not in known and not given:
-                    at = repo.at(module, node.lineno)
-                    yield f"reads {option}, and {group} has no such option ({at})"
+            made = repo.definition("arguments", group) if group else None
+            own = {each.attr.removeprefix("_") for each in every(made, ast.Attribute)}
+            other = made is None or name in {text_of(to) for to, _ in assigned(function)}
+            read = (each for each in every(function, ast.Attribute) if each not in gone)
+            for node in read if not other else ():
+                option = f"{name}.{node.attr}"
+                if text_of(node) == option and node.attr not in own:
+                    given = re.compile(rf"\b{option} = |(set|has)attr\({name}\b")
+                    if not any(map(given.search, (text_of(tree), *texts_of(repo).values()))):
+                        at = repo.at(module, node.lineno)
+                        yield f"reads {option}, and {group} has no such option ({at})"
 
 
 def _lengths(
