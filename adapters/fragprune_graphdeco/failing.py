@@ -28,6 +28,7 @@ from fragprune_graphdeco.reading import (
 from fragprune_graphdeco.syntax import (
     assigned,
     chosen,
+    decided,
     entries,
     every,
     is_off,
@@ -55,7 +56,7 @@ def reasons(repo: HostRepo, scripts: tuple[str, ...]) -> tuple[str, ...]:
     saver = ModelClass(repo).saver
     if saver and saver.name != "save_ply" and ".save_ply(" not in text_of(saver):
         found.append(f"Scene.save writes its PLY by {saver.name}, which saves no thresholds")
-    found += [*_left_out(repo, scripts), *_of_scene(repo), *_of_authors(repo)][:1]
+    found += [*_left_out(repo, scripts), *_of_scene(repo), *_of_authors(repo, scripts)][:1]
     found += [*unlike_3dgs(repo)][:1]
     for script in scripts:
         module = module_of(script)
@@ -275,23 +276,45 @@ def unlike_3dgs(repo: HostRepo) -> Iterator[str]:
             yield f"its cameras are no pinholes, {each.arg}={angle} ({at})"
 
 
-def _of_authors(repo: HostRepo) -> Iterator[str]:
-    """Files that the scene, or the model as it is made, loads by a path of its author's, whatever
-    the command says.
+def _of_authors(repo: HostRepo, scripts: Iterable[str]) -> Iterator[str]:
+    """Files that the scene, the model as it is made, or what else scripts make loads by a path of
+    its author's, whatever the command says.
     """
     made = [("scene", "scene", "Scene.__init__")]
     made.append(("model", MODEL, "GaussianModel.create_from_pcd"))
+    for module in map(module_of, scripts):
+        calls = [each for part in learning(repo.tree(module)) for each in every(part, ast.Call)]
+        for name in sorted({e.func.id for e in calls if isinstance(e.func, ast.Name)}):
+            home, found = definition_of(repo, module, name)
+            if isinstance(found, ast.ClassDef):
+                made.append((found.name, home, f"{found.name}.__init__"))
     for what, module, name in made:  # it grows
-        body = getattr(repo.function(module, name), "body", ())
-        for node in (each for each in body if isinstance(each, ast.Assign | ast.Expr)):
-            calls = every(node, ast.Call)
-            for value in (node.value, *(arg for each in calls for arg in each.args[:1])):
-                if re.fullmatch(r"(/|[A-Z]:)\S+\.\w+", str(getattr(value, "value", ""))):
-                    at = repo.at(module, node.lineno)
-                    yield f"its {what} loads {value.value} ({at})"  # type: ignore[attr-defined]
+        for node in _surely(repo, module, getattr(repo.function(module, name), "body", ())):
+            calls = [*every(node, ast.Call)]
+            first = [arg for each in calls for arg in each.args[:1]]
+            for value in (*first, getattr(node, "value", None)):
+                path = getattr(value, "value", "") if isinstance(value, ast.Constant) else ""
+                if re.fullmatch(r"(/|[A-Z]:)\S+\.\w+", str(path)):
+                    yield f"its {what} loads {path} ({repo.at(module, node.lineno)})"
             names = (text_of(each.func).partition("self.")[2] for each in calls)
             inner = [(what, module, f"{name.partition('.')[0]}.{each}") for each in names]
             made += [each for each in inner if each not in made]
+
+
+def _surely(repo: HostRepo, module: str, body: Iterable[ast.stmt]) -> Iterator[ast.stmt]:
+    """Simple statements that code does whatever is asked for; a module's constants are known."""
+    top = [n for n in getattr(repo.tree(module), "body", ()) if isinstance(n, ast.Assign)]
+    constants = {text_of(to): each.value for each in top for to in each.targets}
+
+    def known(node: ast.AST) -> list[Any]:
+        value = constants.get(text_of(node))
+        return [value.value] if isinstance(value, ast.Constant) else []
+
+    for node in body:
+        if isinstance(node, ast.If) and (taken := decided(node.test, known)) is not None:
+            yield from _surely(repo, module, node.body if taken else node.orelse)
+        elif isinstance(node, ast.Assign | ast.Expr):
+            yield node
 
 
 _CAMERA = re.compile(r"viewpoint(_?cam(era)?)?")

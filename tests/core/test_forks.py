@@ -1238,6 +1238,21 @@ def test_a_model_that_loads_a_file_of_its_authors_as_it_is_made_is_refused(
 
 
 @pytest.mark.parametrize(
+    ("asked", "runs"), [("PRETRAINED", False), ("not PRETRAINED", True), ("self.pretrained", True)]
+)
+def test_what_else_a_script_makes_may_load_a_file_of_its_authors(tmp_path, asked, runs):
+    named = (
+        "from scene import GaussianModel",
+        "from scene.net import Net\nfrom scene import GaussianModel",
+    )
+    repo = fork(tmp_path, named, ("    scene = Scene(", "    net = Net()\n    scene = Scene("))
+    made = f"    def __init__(self):\n        if {asked}:\n            load('/media/me/net.pth')\n"
+    (tmp_path / "scene/net.py").write_text(f"PRETRAINED = True\n\n\nclass Net:\n{made}")
+    said = "its Net loads /media/me/net.pth (scene/net.py:7)"
+    assert errors(repo) == [] if runs else said in str(errors(repo))
+
+
+@pytest.mark.parametrize(
     ("taken", "given", "runs"),
     [
         ("views[1.0]", "scene_info.train_cameras", False),
