@@ -360,8 +360,8 @@ def _of_options(repo: HostRepo, module: str) -> Iterator[str]:
             read = (each for each in every(function, ast.Attribute) if each not in gone)
             for node in read if not other else ():
                 option = f"{name}.{node.attr}"
-                if text_of(node) == option and node.attr not in own:
-                    given = re.compile(rf"\b{option} = |(set|has)attr\({name}\b")
+                if text_of(node) == option and node.attr not in {*own, "__dict__"}:
+                    given = re.compile(rf"\b({option} = |{name}\.__dict__)|(set|has)attr\({name}\b")
                     if not any(map(given.search, (text_of(tree), *texts_of(repo).values()))):
                         at = repo.at(module, node.lineno)
                         yield f"reads {option}, and {group} has no such option ({at})"

@@ -1299,6 +1299,8 @@ class OptimizationParams(ParamGroup):
         ("opt.rate", True),
         ("opt.densify_until_iter", True),
         ("getattr(opt, 'folder', None)", True),
+        ("len(opt.__dict__)", True),
+        ("opt.__dict__.update(opt.folder)", True),
         ("opt.folder if hasattr(opt, 'folder') else 0", True),
         ("1\n    opt.folder = place\n    used = opt.folder", True),
     ],
