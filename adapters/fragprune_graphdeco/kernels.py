@@ -24,7 +24,7 @@ _ALPHA = re.compile(r"\b(?:float|double|auto)\s+alpha\s*=([^;]+);")
 _BLENDS = re.compile(r"1(?:\.0?f?)?\s*-\s*alpha\b|\balpha\s*<\s*1")
 """What a blended alpha leaves of the light behind it, or when it is too faint to be blended."""
 _BRANCHES = re.compile(r"\balpha\s*=(?!=)([^;]+);")  # of an alpha that is declared without a value
-_JACOBIAN = re.compile(r"\bJ\s*=\s*glm::mat3(?:x3)?\s*(\([^;]+\))\s*;")
+_JACOBIAN = re.compile(r"\bJ\s*=\s*(?:glm::)?mat3(?:x3)?\s*(\([^;]+\))\s*;")
 _FILTER = re.compile(r"\bcov(?:\[(?:0\]\[0|1\]\[1)\]|\.x|\.z)\s*\+=?\s*(?!cov\b)([\w.]+)")
 _NEAREST = "Gaussians nearer than"
 _NUMBERS = {

@@ -66,6 +66,7 @@ def errors(repo, adapter=Vanilla3DGS):
     [
         ("p_view.z <= 0.2f", "p_view.z <= NEAREST", ""),
         ("1.0f / 255.0f", "FAINTEST", "fragments fainter than 1.0/2.0"),
+        ("glm::mat3 J = glm::mat3", "mat3 J = mat3", ""),
         ("float power =", "S[0][0] = scale.x; float power =", ""),
         ("float power =", "S[0][0] = wide.x; float power =", "S[0][0]=wide.x"),
         ("if (alpha < 1.0f / 255.0f) continue;", "", "no test for fragments fainter than"),
