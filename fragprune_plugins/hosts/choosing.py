@@ -60,9 +60,10 @@ def locate(
 
 
 def folder_above(repo: HostRepo) -> list[HostRepo]:
-    """The folder above, if scripts import what lies in it."""
+    """The folder above, if scripts import what lies in it, and no packages are installed there."""
     above = HostRepo(repo.root.parent)
-    return [above] if any(map(above.path, repo.imported)) else []
+    used = any(map(above.path, repo.imported)) and not any(above.root.glob("*.dist-info"))
+    return [above] if used else []
 
 
 def choose(
@@ -93,9 +94,8 @@ def choose(
         remedy = f"Choose {' or '.join(others)}, which fits." if others else remedy
         raise UnknownHostError(str(repo.root), found, expected, remedy)
     selected = select(repo=repo, matches=[*fitting.values()]) if select else None
-    for each in fitting:
-        if each.name == selected:
-            return each
+    if chosen := [each for each in fitting if each.name == selected]:
+        return chosen[0]
     found = f"several adapters fit: {', '.join(each.name for each in fitting)}"
     raise UnknownHostError(str(repo.root), found, "one", "Name it with --adapter.")
 

@@ -254,10 +254,18 @@ def test_a_host_whose_scripts_import_an_installed_one_is_not_that_host(tmp_path,
 
 
 @pytest.mark.parametrize(
-    ("line", "found"), [("from scene import Scene", True), ("import os", False)]
+    ("line", "installed", "found"),
+    [
+        ("from scene import Scene", "readme", True),
+        ("from scene import Scene", "tqdm-4.67.dist-info", False),
+        ("import os", "readme", False),
+    ],
 )
-def test_the_folder_above_is_read_if_a_script_uses_it(tmp_path, line, found):
+def test_the_folder_above_is_read_if_a_script_uses_it_but_not_where_packages_are_installed(
+    tmp_path, line, installed, found
+):
     host = skeleton(tmp_path)
+    (tmp_path / installed).mkdir()
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "train.py").write_text(line)
     inner, adapters = HostRepo(tmp_path / "mine"), load_plugins().adapters
