@@ -13,7 +13,7 @@ from fragprune_plugins.engines import create_engine
 from fragprune_plugins.errors import InputError, UsageError
 from fragprune_plugins.learning.thresholds import MOMENTS, ThresholdStore
 from fragprune_plugins.workbench.figures.evaluate import Candidate, psnrs
-from fragprune_plugins.workbench.finetune import loop
+from fragprune_plugins.workbench.finetune import relocation
 from fragprune_plugins.workbench.finetune.relocation import (
     DEEPER,
     PACE,
@@ -163,7 +163,7 @@ def test_area_has_a_price_while_gaussians_move_and_cutoffs_learn(
         return finetune(mine, dataset, settings, engine=engine, relocate=torch.tensor([4]))
 
     priced = sizes().model.scaling
-    monkeypatch.setattr(loop, "COMPACT", 0.0)
+    monkeypatch.setattr(relocation, "COMPACT", 0.0)
     free = sizes().model.scaling
     assert (priced.sum() < free.sum()) == smaller
     assert torch.equal(priced, free) != smaller
