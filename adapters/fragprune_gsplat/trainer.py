@@ -23,7 +23,10 @@ from fragprune_plugins.adapting import (
     HostRepo,
     NotComparedError,
     Photographs,
+    Role,
     ScriptAdapter,
+    Seam,
+    SeamCall,
     UsageError,
 )
 
@@ -39,6 +42,10 @@ ONLY = {
 }
 """Flags with values that stage 2 cannot follow; these values it can."""
 NEAR = 0.01  # the near plane of ``rasterization``
+BESIDE = ("post-processing", "use-bilateral-grid")  # these change colours
+OFF = ["None"], ["False"]
+IDENTITY = [[float(row == column) for column in range(4)] for row in range(4)]
+_WHERE = "gsplat's simple_trainer"
 _OWN_FIGURES = "Compare its own figures of held-out views, stats/val_step*.json in --result_dir."
 DEFINES = ("create_splats_with_optimizers", "Runner.train", "main")
 
@@ -84,10 +91,12 @@ class TrainerDialect(GsplatDialect):
 class SimpleTrainer(Gsplat, ScriptAdapter):
     """The adapter of a copy of the script, with the installed gsplat."""
 
-    seams = (*Gsplat.seams, LPIPS)
-
     def __init__(self, script: Path) -> None:
         self.script = script
+        self.world: tuple[tuple[float, ...], ...] | None = None  # see ``Photographs``
+        parser = "datasets.colmap", "Parser.__init__"
+        scene = Seam(Role.SCENE, *parser, external=True, how=self._note_world)
+        self.seams = (*Gsplat.seams, LPIPS, scene)
 
     def dialect(self, repo: HostRepo) -> TrainerDialect:
         """The installed version's."""
@@ -121,8 +130,13 @@ class SimpleTrainer(Gsplat, ScriptAdapter):
                 raise UsageError(where, " ".join(values) or "given", " or ".join(known), remedy)
 
     def lengthened(self, arguments: list[str], first: int, last: int) -> list[str]:
-        """Arguments with which the script trains on until ``last``, and saves at ``first`` too."""
+        """Arguments with which the script trains on until ``last``, and saves at ``first`` too.
+
+        Checkpoints show nobody but gsplat what was trained, so PLYs as well where it writes them.
+        """
         flags, out = given(arguments), [*arguments, "--max_steps", str(last)]
+        if "save_ply" in self._fields() and flags.keys().isdisjoint({"save-ply", "no-save-ply"}):
+            out.append("--save_ply")
         for name in LISTS & self._fields().keys():
             stated = {int(each) for each in flags.get(name.replace("_", "-"), ())}
             out += [f"--{name}", *map(str, sorted({first, last, *stated}))]
@@ -141,30 +155,39 @@ class SimpleTrainer(Gsplat, ScriptAdapter):
         return defaults(HostRepo(self.script.parent), self.script.stem, "Config")
 
     def photographs(self, repo: HostRepo, arguments: list[str]) -> Photographs:
-        """The photographs, where the script leaves the world as it is and saves PLYs."""
-        flags = given(arguments)
-        needed = {
-            "no-normalize-world-space": "a world that the script turns and scales",
-            "save-ply": "checkpoints alone",
-        }
-        found = [why for flag, why in needed.items() if flag not in flags]
+        """The photographs, where the script trains by them alone and saved PLYs."""
+        flags, defaults = given(arguments), self._fields()
+        folder, out, factor = (
+            flags.get(name.replace("_", "-"), [str(defaults[name])])[0]
+            for name in ("data_dir", "result_dir", "data_factor")
+        )
+        beside = [each for each in BESIDE if flags.get(each, OFF[0]) not in OFF]
+        found = [f"--{each}, which a PLY lacks" for each in beside]
+        if not [*Path(out).rglob("ply/*.ply")]:
+            found.append("checkpoints alone")
+        if flags.get("data-type", ["colmap"]) != ["colmap"]:
+            found.append("data of another kind than COLMAP's")
         if flags.get("test-every", ["8"]) != ["8"]:
             found.append("other held-out views than every eighth")
         if found:
-            where = "gsplat's simple_trainer"
-            expected = "--no-normalize-world-space --save_ply, and --test_every as it is"
-            raise NotComparedError(where, ", ".join(found), expected, _OWN_FIGURES)
-        factor = flags.get("data-factor", [str(self._fields()["data_factor"])])[0]
-        images = "images" if factor == "1" else f"images_{factor}"
-        folder = Path(flags["data-dir"][0])
-        return Photographs(folder, images=images, centred=False, opaque=True)
+            expected = "what the script reads by default, and --save_ply"
+            raise NotComparedError(_WHERE, ", ".join(found), expected, _OWN_FIGURES)
+        scene, images = Path(folder), "images" if factor == "1" else f"images_{factor}"
+        if (scene / f"{images}_png").is_dir():  # it makes these itself in place of JPEGs
+            images = f"{images}_png"
+        return Photographs(scene, images=images, centred=False, opaque=True, world=self.world)
+
+    def _note_world(self, call: SeamCall) -> None:
+        """Keep what the reader of a scene did to the world: it turns and scales it by default."""
+        world = call.instance.transform.tolist()
+        self.world = None if world == IDENTITY else tuple(map(tuple, world))
 
     def drawing(self, repo: HostRepo, arguments: list[str]) -> dict[str, Any]:
         """Near plane, gsplat's cap on alpha, ``--antialiased``; no far plane: NotComparedError."""
         flags, names = given(arguments), [word.replace("_", "-") for word in arguments]
         if "far-plane" in flags:
-            where, found = "gsplat's simple_trainer", "a far plane, which our readers do not have"
-            raise NotComparedError(where, found, "pictures as the script draws them", _OWN_FIGURES)
+            found = "a far plane, which our readers do not have"
+            raise NotComparedError(_WHERE, found, "pictures as the script draws them", _OWN_FIGURES)
         near = flags.get("near-plane", [self._fields().get("near_plane", NEAR)])[0]
         rules: dict[str, Any] = {"near": float(near), "alpha_max": self.dialect(repo).alpha_max}
         asked = [name for name in names if name in ("--antialiased", "--no-antialiased")]

@@ -9,6 +9,8 @@ from pathlib import Path
 from fragprune_plugins.constants import SIDE_MAX
 from fragprune_plugins.errors import InputError
 
+Similarity = tuple[tuple[float, ...], ...]  # four rows of four
+
 WIDEST = 1600  # pixels; hosts shrink wider images to this width where no size is asked for (-r -1)
 
 
@@ -62,6 +64,7 @@ class Photographs:
         centred: whether the principal point is a picture's middle, as in 3DGS; None if unknown.
         opaque: the host drops alpha channels, as 3DGS does of a COLMAP scene.
         held_out: the host does not train on what is held out here.
+        world: takes the scene's world into that of the models; None if it is the same.
     """
 
     folder: Path
@@ -71,3 +74,4 @@ class Photographs:
     centred: bool | None = None
     opaque: bool = False
     held_out: bool = True
+    world: Similarity | None = None

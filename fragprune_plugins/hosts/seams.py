@@ -22,7 +22,10 @@ class Role(Enum):
         how: what the seam's ``how`` returns for a call, and when it is called; "" if it is not.
     """
 
-    SCENE = "learn where the host writes its output"
+    SCENE = (
+        "learn where the host writes its output",
+        "after: nothing; it may note what it needs of a scene that was read",
+    )
     ATTACH = "give the model its threshold store", "after: its optimizers, the main one first"
     STEP = (
         "count one training step",

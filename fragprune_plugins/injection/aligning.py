@@ -64,6 +64,32 @@ def on_rearrange(session: SessionState, call: SeamCall) -> Any:
     return result
 
 
+def keep_rows(session: SessionState, model: Any, kept: Tensor) -> None:
+    """Remove the Gaussians but for ``kept``, (N,) bool, between two steps of a training.
+
+    Whatever has a row for each keeps a part: parameters, which are new ones, moments, statistics.
+    """
+    parts: dict[Tensor, Tensor] = {}
+    for held in (vars(model), vars(model).get("_parameters", {})):
+        rows = {k: v for k, v in held.items() if isinstance(v, Tensor) and len(v.shape) > 0}
+        for name, old in rows.items():
+            if len(old) == len(kept):
+                part = old.detach()[kept]
+                trains = isinstance(old, torch.nn.Parameter)
+                held[name] = parts[old] = torch.nn.Parameter(part) if trains else part
+    for optimizer in filter(None, (each() for each in session.optimizers[model])):
+        for group in optimizer.param_groups:
+            group["params"] = [parts.get(each, each) for each in group["params"]]
+        for old in parts.keys() & optimizer.state.keys():
+            moments = optimizer.state.pop(old)
+            optimizer.state[parts[old]] = {
+                name: each[kept] if getattr(each, "shape", ())[:1] == kept.shape else each
+                for name, each in moments.items()
+            }
+    with session.changing(session.models[model].store, "keep"):
+        session.models[model].store.keep(kept)
+
+
 def _rows(session: SessionState, call: SeamCall) -> dict[str | None, Tensor]:
     """What tells a model's rows apart, by group: all values but colours that are not copied."""
     told = {each.name for each in session.adapter.groups if each.copied or not each.colour}

@@ -43,8 +43,8 @@ class RunOptions:
             result already, nothing runs. If an earlier run of the same command finished stage 1
             and not stage 2, "auto" begins with stage 2.
         trust: go on where the host's own rasterizer draws otherwise than our engine.
-        look: is called before stage 2 resumes a model whose PLY alone shows what the host draws;
-            None learns as asked.
+        look: is called before stage 2 of a model whose PLY alone shows what the host draws; None
+            learns as asked.
     """
 
     adapter: str | None = None

@@ -23,6 +23,7 @@ from fragprune_plugins.injection.stepping import (
     asking_for_no_gradient,
     begin_step,
     frozen_parameters,
+    look_at,
 )
 from fragprune_plugins.learning.area import area_per_pixel
 from fragprune_plugins.learning.goals import Fewer
@@ -65,6 +66,7 @@ def on_view(session: SessionState, call: SeamCall) -> Any:
     begins = session.adapter.steps_by_rendering and session.learn and learned
     if begins and state is not None and not state.begun:
         if call.how(True):
+            look_at(session, model, state, model if own else session.adapter.model_of(call))
             begin_step(session, model, state)
         else:
             expect_to_train(session, call, model)

@@ -96,6 +96,8 @@ class Session(SessionState):
             if extra is not None and extra.module not in sys.modules:  # late, it is the host's
                 self._ledger.wrap(extra, partial(enter, extra))
             self._ledger.wrap(rasterizing.SCALER, partial(rasterizing.refuse_scaled, self))
+            if self.look is not None and self.adapter.steps_by_rendering:
+                self._ledger.wrap(stepping.LOADER, partial(stepping.on_photograph, self))
             self.stand_ins.refuse_leftovers(self.repo.root)
         except BaseException:
             self._take_back()

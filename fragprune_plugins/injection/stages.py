@@ -16,6 +16,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from fragprune_plugins.errors import (
     HostFailed,
     Interrupted,
@@ -33,12 +36,15 @@ from fragprune_plugins.hosts.source import HostRepo
 from fragprune_plugins.injection import process, starting, workers
 from fragprune_plugins.injection.command import HostCommand
 from fragprune_plugins.injection.options import RunOptions, RunSummary
+from fragprune_plugins.injection.rasterizing import directly
 from fragprune_plugins.injection.session import Session
 from fragprune_plugins.injection.starting import Start
 from fragprune_plugins.learning.events import Summary
 from fragprune_plugins.learning.interruption import Terminate, sigterm_interrupts
 from fragprune_plugins.learning.schedule import JointSchedule, Settings
 from fragprune_plugins.plugins.loading import Plugins
+
+_STAYING = 0.9  # of the Gaussians: at the end of an iteration 3DGS-MCMC moves some that show little
 
 
 @dataclass
@@ -132,7 +138,8 @@ class Stages:
         arguments = self.adapter.lengthened(self.host.arguments, total, last)
         for folder in self._apart().values():
             arguments += [self.host.line.output[-1], folder]
-        self._learn(last, arguments, from_step=total, settings=settings)
+        look = partial(self._look_within, total) if self.options.look else None
+        self._learn(last, arguments, from_step=total, settings=settings, look=look)
         self.before = self._model(total)
 
     def finetune(self) -> None:
@@ -197,23 +204,47 @@ class Stages:
 
     def _look(self, resumed: Path, iteration: int) -> tuple[Settings, Path]:
         """What a look at the model of stage 1 gives, and the file to resume with what it keeps."""
-        settings, before, look = self.options.settings, self.before, self.options.look
-        if look is None or before is None:
-            return settings, resumed
-        host, own = (self.repo, self.host.arguments), self.scratch / "whole" / resumed.name
+        whole = [resumed]
+
+        def ready(before: Path) -> None:
+            if not starting.holds(resumed, before):
+                whole[0] = self.scratch / "whole" / resumed.name
+                whole[0].parent.mkdir(exist_ok=True)
+                self.adapter.checkpoint_from_ply(before, iteration, whole[0])
+                log.info("from %s instead: its iteration changed Gaussians after that", before)
+
+        settings, kept = self._looked(self.before, ready)
+        return settings, starting.part_of(whole[0], kept, self.scratch)
+
+    def _look_within(self, iteration: int, model: Any) -> tuple[Settings, Tensor | None]:
+        """The same in one run, in which the host trains on."""
+        means = self.adapter.means(model).detach()
+
+        def ready(before: Path) -> None:
+            known = before.suffix == ".ply" and starting.same_means(before, [means.cpu()], _STAYING)
+            if not known:
+                found, expected = "other Gaussians than those that train", "a PLY of the same"
+                raise NotComparedError(str(before), found, expected, "")
+
+        with torch.random.fork_rng([means.device] if means.is_cuda else []), directly(means.device):
+            self.settings, kept = self._looked(self._model(iteration), ready)
+        return self.settings, kept if kept is None else kept.to(means.device)
+
+    def _looked(
+        self, before: Path | None, ready: Callable[[Path], None]
+    ) -> tuple[Settings, Tensor | None]:
+        """What a look at a PLY gives, if it is ``ready``; else the settings that were asked for."""
+        settings, host = self.options.settings, (self.repo, self.host.arguments)
+        if self.options.look is None or before is None:
+            return settings, None
         try:
             photographs, drawing = self.adapter.photographs(*host), self.adapter.drawing(*host)
-            if not starting.holds(resumed, before):
-                own.parent.mkdir(exist_ok=True)
-                self.adapter.checkpoint_from_ply(before, iteration, own)
-                log.info("from %s instead: its iteration changed Gaussians after that", before)
-                resumed = own
-            settings, kept = look(before, photographs, drawing, settings)
-            return settings, starting.part_of(resumed, kept, self.scratch)
+            ready(before)
+            return self.options.look(before, photographs, drawing, settings)
         except (NotComparedError, UsageError) as error:
             why = f"{error.where}: {error.found}"
         log.warning("stage 2 learns as asked, without a look at the model: %s", why)
-        return settings, resumed
+        return settings, None
 
     def _execute(
         self,
@@ -223,6 +254,7 @@ class Stages:
         settings: Settings | None = None,
         ended: Callable[[Session], None] = lambda _: None,
         kept: Callable[[], Path | None] = lambda: None,
+        look: Callable[[Any], tuple[Settings, Tensor | None]] | None = None,
         **options: Any,
     ) -> None:
         """Run the host's script in a session with these options; ``ended`` gets it at its end."""
@@ -239,7 +271,7 @@ class Stages:
             output=self.output,
             **options,
         )
-        session.unproved = self.unproved
+        session.unproved, session.look = self.unproved, look
         known, host = set(sys.modules), self.host
         folder = Path.cwd() if host.module else host.script.parent
         try:

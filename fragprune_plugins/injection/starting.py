@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -167,13 +167,17 @@ def holds(start: Path, ply: Path) -> bool:
 
     Hosts write a PLY before they densify or relocate in its iteration, a checkpoint after that.
     """
-    if start.suffix == ".ply":
-        return True
+    return start.suffix == ".ply" or same_means(ply, tensors_of(_read_checkpoint(start)[0]))
+
+
+def same_means(ply: Path, among: Iterable[Tensor], share: float = 1.0) -> bool:
+    """Whether one of some tensors has the means of a PLY, or a share of them, but for a step."""
     rows = PlyData.read(ply)["vertex"].data
     xyz = torch.stack([torch.from_numpy(rows[each].copy()) for each in "xyz"], dim=1)
     far = 0.01 * (xyz - xyz.median(dim=0).values).abs().median()  # no step moves one as far
-    same = (each for each in tensors_of(_read_checkpoint(start)[0]) if each.shape == xyz.shape)
-    return any(bool(((each - xyz).abs() <= far).all()) for each in same)
+    same = (each for each in among if each.shape == xyz.shape)
+    near = (((each - xyz).abs() <= far).all(dim=1).float().mean() for each in same)
+    return any(float(each) >= share for each in near)
 
 
 def part_of(start: Path, kept: Tensor | None, folder: Path) -> Path:

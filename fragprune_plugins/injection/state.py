@@ -82,6 +82,9 @@ class SessionState:
     """
 
     stand_ins: StandIns
+    look: Callable[[Any], tuple[Settings, Tensor | None]] | None = None
+    """Where stage 2 follows in one run, is given the model before its first step: it learns with
+    the settings and the Gaussians, (N,) bool, that this gives; None for all."""
 
     def __init__(
         self,

@@ -10,22 +10,29 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from fragprune_plugins.errors import log
-from fragprune_plugins.hosts.seams import SeamCall
+from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
 from fragprune_plugins.injection import ranks
+from fragprune_plugins.injection.aligning import keep_rows
 from fragprune_plugins.injection.state import ModelState, SessionState
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.learning.stage2 import Stage2
 from fragprune_plugins.learning.thresholds import ThresholdStore
 from fragprune_plugins.plugins import hookspecs
-from fragprune_plugins.plugins.hooks import thresholds_for
+from fragprune_plugins.plugins.hooks import schedule_for, thresholds_for
+
+LOADER = Seam(
+    Role.STEP, "torch.utils.data.dataloader", "_BaseDataLoaderIter.__next__", external=True
+)
 
 
 def on_scene(session: SessionState, call: SeamCall) -> Any:
     """Note the host's output folder, and its model."""
     result = call.run()
+    call.how()
     model = getattr(call.instance, "gaussians", None)
     session.main = weakref.ref(model) if model is not None else None
     if getattr(call.instance, "model_path", None):
@@ -84,6 +91,40 @@ def stage2(session: SessionState, model: Any, state: ModelState) -> Stage2:
         watch=partial(report, session, state),
         parameters=parameters,
     )
+
+
+def on_photograph(
+    session: SessionState, read: Callable[..., Any], _: Any, args: Any, kwargs: Any
+) -> Any:
+    """Look at a model when the host reads the photograph for the first view of stage 2.
+
+    When it draws, arguments are made of Gaussians that may be removed.
+    """
+    model, state = session.last() if session.last else None, session.last_state
+    if model is not None and state is not None and torch.is_grad_enabled():  # no evaluation
+        look_at(session, model, state)
+    return read(*args, **kwargs)
+
+
+def look_at(session: SessionState, model: Any, state: ModelState, drawn: Any = None) -> None:
+    """Before the first step of a stage 2 in one run, learn with what a look at the model gives.
+
+    Args:
+        drawn: what the host is about to draw, if it is: the model, or tensors made of it.
+    """
+    if session.look is None or state.steps != session.from_step:
+        return
+    look, session.look = session.look, None
+    late = isinstance(drawn, Tensor)
+    if late or len(session.models) > 1:
+        why = "its host draws without reading a photograph" if late else "several models train"
+        log.warning("stage 2 learns as asked, without a look at the model: %s", why)
+        return
+    session.settings, kept = look(model)
+    session.schedule = schedule_for(session.settings, session.plugins)
+    if kept is not None:
+        keep_rows(session, model, kept)
+    state.stage = stage2(session, model, state)
 
 
 def report(session: SessionState, state: ModelState, stats: StepStats) -> None:
@@ -160,6 +201,7 @@ def on_step(session: SessionState, call: SeamCall) -> Any:
     if state is None or not session.learn:
         return result
     if not (session.adapter.steps_by_rendering and state.begun):
+        look_at(session, call.model, state)
         begin_step(session, call.model, state)
     return call.how(result) if session.standing_still(call.model) else result
 

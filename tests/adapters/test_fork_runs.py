@@ -9,6 +9,7 @@ from miniatures.changed import ForkHost
 from miniatures.runs import FINETUNE, OPTIONS, check_stage_two, edit, frozen_differences
 
 from fragprune_plugins.files import sidecar
+from fragprune_plugins.files.ply import read_ply
 from fragprune_plugins.injection.launch import run
 from fragprune_plugins.learning.goals import Control
 
@@ -49,6 +50,34 @@ def test_a_fork_without_checkpoints_is_pruned_in_one_run(fork, photographs, tmp_
     again = run(words, control)  # it cannot resume either
     assert again.model_after.is_relative_to(tmp_path / "out/control")
     assert again.steps == 8
+
+
+ENDED = ("--densify_until_iter", 8)
+
+
+def every_second(ply, photographs, drawing, settings):
+    """A look at a model."""
+    return replace(settings, dropout=0.25), torch.arange(len(read_ply(ply))) % 2 == 0
+
+
+def test_in_one_run_a_fork_begins_stage_two_with_what_a_look_keeps(fork, photographs, tmp_path):
+    edit(fork / "train_scene.py", "chkpnt", "state")
+    words = runs.command(fork / "train_scene.py", photographs, tmp_path / "out", 12, *ENDED)
+    summary = run([*words, "--save_iterations", "13"], replace(OPTIONS, look=every_second))
+    first = summary.model_before.parent.with_name("iteration_13") / "point_cloud.ply"
+    whole = len(read_ply(summary.model_before))
+    assert len(read_ply(first)) == summary.gaussians == (whole + 1) // 2
+    check_stage_two(replace(summary, model_before=first), "3dgs-fork")
+    assert summary.settings["dropout"] == 0.25
+
+
+def test_of_several_models_none_is_looked_at(fork, photographs, tmp_path, caplog):
+    train = fork / "train_scene.py"
+    edit(train, SCENE, f'{PAIR}{SCENE}    pair["second"].training_setup(opt)\n')
+    words = runs.command(train, photographs, tmp_path / "out", 12, *ENDED)
+    summary = run(words, replace(OPTIONS, look=every_second))
+    assert "without a look at the model: several models train" in caplog.text
+    assert summary.settings["dropout"] is None
 
 
 SCENE = "    scene = Scene(dataset, gaussians)\n    gaussians.training_setup(opt)\n"

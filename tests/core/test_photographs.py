@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 from finetune import tiny
 from hypothesis import given
 from hypothesis import strategies as st
@@ -13,6 +14,7 @@ from miniatures.skeletons import skeleton
 
 from fragprune_graphdeco.adapter import resolution
 from fragprune_plugins.adapting import HostRepo, NotComparedError, Photographs, Resolution
+from fragprune_plugins.errors import RecordError
 from fragprune_plugins.workbench.demo import work
 from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.figures.records import Recorded, recorded
@@ -21,6 +23,7 @@ from fragprune_vanilla_3dgs import Vanilla3DGS
 
 HOST = HostRepo(Path(work.__file__).with_name("host"))
 SIDES = st.integers(1, 6000)
+WORLD = ((0.0, -2.0, 0.0, 1.0), (2.0, 0.0, 0.0, 0.0), (0.0, 0.0, 2.0, -3.0), (0.0, 0.0, 0.0, 1.0))
 
 
 def command(*words, host=HOST):
@@ -147,11 +150,43 @@ def test_a_command_that_holds_nothing_out_learns_from_all(tmp_path):
     "size",
     [Resolution(), Resolution(4), Resolution(width=7), Resolution(width=9, shrink_only=True)],
 )
-def test_photographs_survive_a_record(size, tmp_path):
-    said = Recorded(Photographs(tmp_path, size, True, "images_2", True), (tmp_path / "a.ply",))
+@pytest.mark.parametrize("world", [None, WORLD])
+def test_photographs_survive_a_record(size, world, tmp_path):
+    read = Photographs(tmp_path, size, True, "images_2", True, world=world)
+    said = Recorded(read, (tmp_path / "a.ply",))
     path = records.leave(tmp_path / "a.ply", "run", {"photographs": said.as_dict()})
     (record,) = records.find(path.parent)
     assert recorded(record) == said
+
+
+@pytest.mark.parametrize("rows", [3, [], WORLD[:3], ["word"] * 4, [[0] * 4] * 4, [[1] * 3] * 4])
+def test_a_record_of_a_world_that_is_no_similarity_is_refused(rows, tmp_path):
+    said = Recorded(Photographs(tmp_path), (tmp_path / "a.ply",)).as_dict()
+    path = records.leave(tmp_path / "a.ply", "run", {"photographs": said | {"world": rows}})
+    (record,) = records.find(path.parent)
+    with pytest.raises(RecordError, match="photographs"):
+        recorded(record)
+
+
+def test_cameras_follow_the_world_into_that_of_the_models(tmp_path):
+    """A point that moves with the world is seen at the same pixel, at a scaled depth."""
+    folder, scale = tiny.scene(tmp_path)[0], 2.0
+    into = torch.tensor(WORLD, dtype=torch.float64)
+    point = torch.tensor([0.2, -0.1, 0.3, 1.0], dtype=torch.float64)
+    read = Photographs(folder)
+    pairs = zip(
+        load_photographs(read).train,
+        load_photographs(replace(read, world=WORLD)).train,
+        strict=True,
+    )
+    for before, after in pairs:
+        there = point @ before.view.projmatrix.double()
+        then = into @ point @ after.view.projmatrix.double()
+        torch.testing.assert_close(then[:2] / then[3], there[:2] / there[3], rtol=1e-5, atol=1e-5)
+        torch.testing.assert_close(then[3], scale * there[3], rtol=1e-5, atol=0)  # float32
+        moved = into[:3, :3] @ before.view.campos.double() + into[:3, 3]
+        torch.testing.assert_close(after.view.campos.double(), moved, rtol=0, atol=1e-5)
+        assert torch.equal(before.image, after.image)
 
 
 @pytest.mark.parametrize(

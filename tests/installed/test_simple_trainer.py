@@ -4,11 +4,13 @@ import contextlib
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from installed.gsplat_host import releases
+from miniatures.datasets.colmap import WORLD
 
 from fragprune_gsplat import Gsplat
 from fragprune_gsplat.trainer import SimpleTrainer
@@ -16,7 +18,11 @@ from fragprune_plugins import Control, Pressure, Settings
 from fragprune_plugins.adapting import HostRepo, Photographs
 from fragprune_plugins.errors import EngineError, NotComparedError, SidecarError, UsageError
 from fragprune_plugins.files import sidecar
+from fragprune_plugins.injection import starting, stepping
 from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.plugins.loading import installed
+from fragprune_plugins.workbench.models.model import load
+from fragprune_plugins.workbench.run.lively import Lively
 
 SCRIPT = Path(__file__).parents[1] / "miniatures" / "simple_trainer.py"
 RELEASES = releases()
@@ -34,10 +40,11 @@ def release(request, monkeypatch):
 def train(tmp_path):
     """``train(*words, stage=...)``: the script's command."""
 
-    def command(*words, strategy="default", settings=None, **options):
+    def command(*words, strategy="default", settings=None, ply=False, **options):
         settings = settings or Settings(iterations=MORE, threshold_lr=0.5, goal=Pressure(1e-2))
         line = [str(SCRIPT), strategy, "--data_dir", str(tmp_path)]
         line += ["--result_dir", str(tmp_path / "out"), "--max_steps", str(TOTAL), *map(str, words)]
+        line += [] if ply else ["--no-save-ply"]
         return run(line, RunOptions(device="cpu", settings=settings, **options))
 
     return command
@@ -132,17 +139,112 @@ def test_absolute_gradients_are_for_strategies_that_run_on_a_gpu_before_stage_tw
         adapter.refuse(repo, ["default", "--strategy.absgrad"], stage=stage, device=device)
 
 
-def test_what_the_script_reads_is_known_where_it_leaves_the_world_as_it_is():
-    words = ["default", "--data-dir", "in", "--save_ply"]
-    with pytest.raises(NotComparedError, match="turns and scales"):
+@pytest.mark.parametrize("normalized", [True, False])
+def test_what_the_script_reads_is_known_once_it_saved_a_ply(
+    normalized, train, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    more = [] if normalized else ["--no-normalize-world-space"]
+    words = ["default", "--data-dir", "in", "--result-dir", "out", *more]
+    with pytest.raises(NotComparedError, match="checkpoints alone"):
         adapter.photographs(repo, words)
-    words += ["--no_normalize_world_space"]
     how = {"centred": False, "opaque": True}  # the scene's own point; three channels of four
+    how["world"] = tuple(map(tuple, WORLD.tolist())) if normalized else None
+    read = train(*more, ply=True).photographs
+    assert read == Photographs(tmp_path, images="images_4", **how)
+    how.pop("world")
     assert adapter.photographs(repo, words) == Photographs(Path("in"), images="images_4", **how)
     whole = adapter.photographs(repo, [*words, "--data_factor=2", "--data_factor", "1"])
     assert whole == Photographs(Path("in"), **how)
-    with pytest.raises(NotComparedError, match="every eighth"):
-        adapter.photographs(repo, [*words, "--test_every", "4"])
+    Path("in", "images_4_png").mkdir(parents=True)  # made by the script, of JPEGs
+    assert adapter.photographs(repo, words).images == "images_4_png"
+    for more, why in {
+        ("--test_every", "4"): "every eighth",
+        ("--data_type", "ncore"): "another kind",
+        ("--use_bilateral_grid",): "bilateral-grid",
+        ("--post_processing=ppisp",): "post-processing",
+    }.items():
+        with pytest.raises(NotComparedError, match=why):
+            adapter.photographs(repo, [*words, *more])
+
+
+class Looked:
+    """Keeps every second Gaussian, draws random numbers, and trains a model of its own."""
+
+    def __call__(self, ply, photographs, drawing, settings):
+        self.model, self.photographs = load(ply), photographs
+        torch.rand(7)
+        torch.nn.Parameter(torch.zeros(1)).sum().backward()
+        return replace(settings, dropout=0.25), torch.arange(len(self.model)) % 2 == 0
+
+
+def test_stage_two_begins_with_what_a_look_between_the_stages_keeps(train, tmp_path):
+    look, out = Looked(), tmp_path / "out"
+    summary = train(ply=True, look=look, settings=Settings(iterations=MORE, train="opacity"))
+    assert look.photographs == summary.photographs
+    first, last = (load(out / f"ply/point_cloud_{at - 1}.ply") for at in (TOTAL, TOTAL + MORE))
+    assert torch.equal(look.model.xyz, first.xyz)
+    assert evaluated(out, TOTAL)["num_GS"] == len(first)  # the script's own figures of stage 1
+    kept = (len(first) + 1) // 2
+    assert evaluated(out, TOTAL + MORE)["num_GS"] == len(last) == summary.gaussians == kept
+    step = 1e-3  # the optimizer's last in stage 1, after the script had saved
+    assert (last.xyz - first.xyz[::2]).abs().max() <= step
+    assert summary.settings["dropout"] == sidecar.load(summary.model_after)[1].settings["dropout"]
+    assert (summary.settings["dropout"], summary.steps) == (0.25, MORE)
+
+
+def test_a_look_leaves_the_trainings_random_numbers_alone(train, tmp_path):
+    class Only(Looked):
+        def __call__(self, *given):
+            super().__call__(*given)
+            return given[-1], None
+
+    looks, found = (None, Only()), []
+    for number, look in enumerate(looks):
+        train("--result_dir", tmp_path / str(number), ply=True, look=look)
+        found.append(load(tmp_path / str(number) / f"ply/point_cloud_{TOTAL + MORE - 1}.ply"))
+    assert torch.equal(found[0].xyz, found[1].xyz)
+
+
+def test_without_a_ply_there_is_no_look_and_that_is_said(train, caplog):
+    look = Looked()
+    assert train(look=look).steps == MORE
+    assert not hasattr(look, "model")
+    assert "without a look at the model: gsplat's simple_trainer: checkpoints alone" in caplog.text
+
+
+def test_nor_where_it_draws_without_reading_a_photograph(train, caplog, monkeypatch):
+    """What it draws then is made of all its Gaussians already."""
+    never = replace(stepping.LOADER, attribute="_BaseDataLoaderIter.__len__")
+    monkeypatch.setattr(stepping, "LOADER", never)
+    assert train(ply=True, look=Looked()).steps == MORE
+    assert "draws without reading a photograph" in caplog.text
+
+
+def test_nor_where_the_script_changed_the_gaussians_since(train, caplog, monkeypatch):
+    monkeypatch.setattr(starting, "same_means", lambda *_: False)
+    assert train(ply=True, look=Looked()).steps == MORE
+    assert "other Gaussians than those that train" in caplog.text
+
+
+def test_gaussians_move_in_stage_two_as_in_a_fine_tuning(train, tmp_path):
+    """By the plugin of ``fragprune run``: its stage is another after the look."""
+    plugins, lively = installed(), Lively()
+
+    class Moving(Looked):
+        def __call__(self, *given):
+            settings, kept = super().__call__(*given)
+            lively.on, lively.rows = True, torch.arange(int(kept.sum()) // 4)
+            return replace(settings, dropout=None), kept
+
+    plugins.register(lively, "lively")
+    try:
+        settings = Settings(iterations=20, goal=Pressure(1e-3))
+        summary = train(ply=True, look=Moving(), settings=settings)
+    finally:
+        plugins.remove("lively")
+    assert lively.relocated == len(lively.rows) > 0
+    assert summary.gaussians == len(load(summary.model_after))
 
 
 @pytest.mark.parametrize(

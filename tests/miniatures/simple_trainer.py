@@ -9,7 +9,9 @@ import random
 from dataclasses import dataclass, fields
 from pathlib import Path
 
+import gsplat
 import torch
+from datasets.colmap import Parser
 from fused_ssim import fused_ssim
 from gsplat.distributed import cli
 from gsplat.rendering import rasterization
@@ -22,9 +24,12 @@ class Config:
     data_factor: int = 4
     result_dir: str = "results"
     ckpt: str | None = None
+    normalize_world_space: bool = True
     max_steps: int = 30_000
     eval_steps: str = "7000 30000"
     save_steps: str = "7000 30000"
+    ply_steps: str = "7000 30000"
+    save_ply: bool = False
     viewer: str = ""
     strategy: str = "default"
 
@@ -56,9 +61,10 @@ def create_splats_with_optimizers(count: int = 60):
 class Runner:
     def __init__(self, config):
         self.config, self.out = config, Path(config.result_dir)
+        self.parser = Parser(config.data_dir, config.normalize_world_space)
         torch.manual_seed(42)
         random.seed(42)
-        for folder in ("ckpts", "stats"):
+        for folder in ("ckpts", "stats", "ply"):
             (self.out / folder).mkdir(parents=True, exist_ok=True)
         self.splats, self.optimizers = create_splats_with_optimizers()
         kind = MCMCStrategy if config.strategy == "mcmc" else DefaultStrategy
@@ -90,8 +96,12 @@ class Runner:
         decay = torch.optim.lr_scheduler.ExponentialLR(
             self.optimizers["means"], 0.01 ** (1 / config.max_steps)
         )
+        photographs = torch.utils.data.DataLoader(range(3), shuffle=True)
+        reading = iter(photographs)
         for step in range(config.max_steps):
-            view = random.randrange(3)
+            if step % 3 == 0:
+                reading = iter(photographs)
+            view = int(next(reading))
             colors, _, info = self.rasterize_splats(view)
             shared = (self.splats, self.optimizers, self.state, step, info)
             self.strategy.step_pre_backward(*shared)
@@ -101,6 +111,10 @@ class Runner:
             if step + 1 in (config.max_steps, *map(int, config.save_steps.split())):
                 saved = {"step": step, "splats": self.splats.state_dict()}
                 torch.save(saved, f"{self.out}/ckpts/ckpt_{step}_rank0.pt")
+            if config.save_ply and step + 1 in map(int, config.ply_steps.split()):
+                export = getattr(gsplat, "export_splats", None)  # 1.4.0 has none
+                if export:
+                    export(**self.splats, save_to=f"{self.out}/ply/point_cloud_{step}.ply")
             for optimizer in self.optimizers.values():
                 optimizer.step()
                 optimizer.zero_grad(set_to_none=True)
@@ -113,7 +127,8 @@ class Runner:
 
     @torch.no_grad()
     def eval(self, step):
-        colors = self.rasterize_splats(3)[0]
+        (view,) = torch.utils.data.DataLoader(range(3, 4))
+        colors = self.rasterize_splats(int(view))[0]
         stats = {"mean": float(colors.mean()), "num_GS": len(self.splats["means"])}
         (self.out / "stats" / f"val_step{step:04d}.json").write_text(json.dumps(stats))
 
@@ -137,7 +152,12 @@ if __name__ == "__main__":
     for field in fields(Config)[:-1]:
         spellings = {f"--{field.name}", f"--{field.name.replace('_', '-')}"}
         several = field.name.endswith("steps") and field.name != "max_steps"
-        parser.add_argument(*spellings, default=field.default, nargs="+" if several else None)
+        if field.type is bool:
+            parser.add_argument(
+                *spellings, default=field.default, action=argparse.BooleanOptionalAction
+            )
+        else:
+            parser.add_argument(*spellings, default=field.default, nargs="+" if several else None)
     values = vars(parser.parse_args())
     values = {k: " ".join(v) if isinstance(v, list) else v for k, v in values.items()}
     config = Config(**values | {"max_steps": int(values["max_steps"])})

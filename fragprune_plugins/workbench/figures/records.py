@@ -16,7 +16,7 @@ import click
 from fragprune_plugins.errors import OutputError, RecordError, printable
 from fragprune_plugins.files.atomic import digest, replacing
 from fragprune_plugins.files.reading import MEBIBYTE, UntrustedFile, lies_in
-from fragprune_plugins.hosts.photographs import Photographs, Resolution
+from fragprune_plugins.hosts.photographs import Photographs, Resolution, Similarity
 
 SUFFIX = ".fragprune.json"
 FORMAT = "fragprune-record-1"
@@ -193,8 +193,19 @@ def recorded(record: Record) -> Recorded | None:
             values["images"],
             centred=None if values.get("centred") is None else bool(values["centred"]),
             opaque=bool(values.get("opaque")),
+            world=_similarity(values.get("world")),
         )
         return Recorded(photographs, models, bool(values["filtered"]), drawing)
+
+
+def _similarity(rows: Any) -> Similarity | None:
+    """``Photographs.world`` of a record; cameras check that it turns and scales alone."""
+    if rows is None:
+        return None
+    world = tuple(tuple(map(float, row)) for row in rows)
+    if [len(row) for row in world] != [4] * 4 or world[3] != (0, 0, 0, 1):
+        raise ValueError(f"world is {rows!r}")
+    return world
 
 
 def control_of(data: dict[str, Any], among: Sequence[Path]) -> dict[str, Any] | None:

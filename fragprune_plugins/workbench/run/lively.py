@@ -58,10 +58,10 @@ class Lively:
         """Follow the optimizers of a model that trains, from its first step on."""
         session = active_session()
         state = session.models.get(model) if session and session.learn else None
-        if not self.on or session is None or state is None or state.stage is None:
+        if session is None or state is None or state.stage is None:
             return
         if {name for name, _ in session.groups(model)} >= _NAMES:
-            lively = _Steps(self, session, weakref.ref(model), state.stage)
+            lively = _Steps(self, session, weakref.ref(model))
             for optimizer in filter(None, (known() for known in session.optimizers[model])):
                 state.hooks.append(optimizer.register_step_pre_hook(lively.before))
                 state.hooks.append(optimizer.register_step_post_hook(lively.after))
@@ -78,16 +78,16 @@ class _Steps:
     Gaussians move with the step of the optimizer that has their positions.
     """
 
-    def __init__(self, of: Lively, session: SessionState, model: Any, stage: Stage2) -> None:
-        self.of, self.session, self.model, self.stage = of, session, model, stage
+    def __init__(self, of: Lively, session: SessionState, model: Any) -> None:
+        self.of, self.session, self.model = of, session, model
         self.rates: dict[str, float] | None = None  # at first; not known before the first step
         self.relocation: Relocation | None = None
         self.after_it = contextlib.ExitStack()
 
     def before(self, optimizer: torch.optim.Optimizer, *_: Any) -> None:
         """Lend the rates of this step, and look where the Gaussians are."""
-        model, stage = self.model(), self.stage
-        if model is None or stage.plan is None:
+        model = self.model()
+        if model is None or not self.of.on or (stage := self.stage).plan is None:
             return
         if self.rates is None:
             self.rates = self._begin(model)
@@ -104,6 +104,13 @@ class _Steps:
             of = self._rows(model), stage.store, moments
             self._compact(of[0])
             self.after_it.enter_context(self.relocation.stepping(stage.steps, *of))
+
+    @property
+    def stage(self) -> Stage2:
+        """The model's; one that follows in one run is another after a look at the model."""
+        stage = self.session.models[self.model()].stage
+        assert stage is not None
+        return stage
 
     def _begin(self, model: Any) -> dict[str, float]:
         """The rates of stage 2 at its first step, by name; none where the host's own stay."""

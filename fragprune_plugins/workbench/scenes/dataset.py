@@ -17,7 +17,7 @@ from torch import Tensor
 
 from fragprune_plugins.errors import DatasetError, InputError, log, printable
 from fragprune_plugins.files.reading import MEBIBYTE
-from fragprune_plugins.hosts.photographs import Photographs, Resolution
+from fragprune_plugins.hosts.photographs import Photographs, Resolution, Similarity
 from fragprune_plugins.types import View, one_line
 from fragprune_plugins.workbench.scenes import colmap, transforms
 from fragprune_plugins.workbench.scenes.images import SUFFIXES, image_size, opened, turned
@@ -268,6 +268,7 @@ def load_dataset(
     images: str = "images",
     centred: bool | None = None,
     opaque: bool = False,
+    world: Similarity | None = None,
 ) -> Dataset:
     """Read a COLMAP folder (sparse/, images/), or Blender's or nerfstudio's transforms files.
 
@@ -283,6 +284,7 @@ def load_dataset(
         centred: render as if each principal point was the middle of its picture, as 3DGS does. None
             does not, but warns where it makes a difference.
         opaque: drop alpha channels, as 3DGS does of a COLMAP folder's images.
+        world: see ``Photographs``.
 
     Raises:
         DatasetError: the folder has neither layout or both, an image is missing, a camera model is
@@ -290,7 +292,7 @@ def load_dataset(
     """
     background = torch.full((3,), float(white_background))
     size = resolution if isinstance(resolution, Resolution) else Resolution(divide=resolution)
-    rows = read_scene(Path(folder), images)
+    rows = [_moved(part, world) for part in read_scene(Path(folder), images)]
     for part in rows:
         (path, views), *_ = Counter(row.image for row in part).most_common(1)
         if views > 1:
@@ -317,6 +319,14 @@ def load_dataset(
             *(printable(str(folder)), dataset.leaked, len(test)),
         )
     return dataset
+
+
+def _moved(rows: list[Posed], world: Similarity | None) -> list[Posed]:
+    """The same, in the world of the models."""
+    if world is None:
+        return rows
+    into = torch.tensor(world, dtype=torch.float64)
+    return [row._replace(camera=row.camera.moved(into)) for row in rows]
 
 
 def _warn_of_turned(images: Iterable[Path]) -> None:

@@ -62,6 +62,15 @@ class Camera:
         focal, centre = (self.fx * x, self.fy * y), (self.cx * x, self.cy * y)
         return Camera(self.rotation, self.translation, width, height, *focal, *centre)
 
+    def moved(self, world: Tensor) -> Camera:
+        """The same camera, where a similarity (4, 4) float64 takes the world into another."""
+        turned, shift = world[:3, :3], world[:3, 3]
+        scale = torch.linalg.det(turned).abs() ** (1 / 3)
+        rotation = self.rotation @ turned.T / scale
+        return replace(
+            self, rotation=rotation, translation=scale * self.translation - rotation @ shift
+        )
+
     def view(self, background: Tensor | None = None) -> View:
         """The camera as a view for engines, computed in float64, float32 in the result."""
         exact, pose = View.pinhole(**vars(self)), ("viewmatrix", "projmatrix", "campos")
