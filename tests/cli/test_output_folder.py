@@ -16,7 +16,8 @@ import fragprune_plugins as fp
 from fragprune_plugins import RasterInputs, load_dataset
 from fragprune_plugins.errors import DatasetError, ModelFileError
 from fragprune_plugins.hosts.photographs import Photographs, Resolution
-from fragprune_plugins.workbench.commands.opening import as_trained
+from fragprune_plugins.workbench.commands.opening import as_trained, photographs_for
+from fragprune_plugins.workbench.commands.options import SceneOptions
 from fragprune_plugins.workbench.figures import records
 from fragprune_plugins.workbench.finetune import work
 from fragprune_plugins.workbench.models.formats.ply import write_ply
@@ -293,6 +294,24 @@ def test_a_model_is_drawn_by_a_record_that_was_copied_before_it(
     assert records.beside(near)
     model.write_bytes(model.read_bytes() + b"\0")
     assert not records.beside(near)
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_the_model_before_is_read_in_the_world_that_the_run_noted(
+    given, data, path, model, tmp_path
+):
+    """gsplat's trainer scales the world: with other cameras the model shows nothing."""
+    before, after = (tmp_path / f"out/ply/point_cloud_{at}.ply" for at in (6, 9))
+    before.parent.mkdir(parents=True)
+    for each in (before, after):
+        write_ply(each, model)
+    world = ((0.5, 0.0, 0.0, 1.0), (0.0, 0.5, 0.0, 0.0), (0.0, 0.0, 0.5, 2.0), (0.0, 0.0, 0.0, 1.0))
+    said = records.Recorded(Photographs(data, world=world), (before, after))
+    records.leave(after, "run", {"photographs": said.as_dict()})
+    scene = SceneOptions(data if given else None)
+    for each in (before, after):
+        assert photographs_for(each, scene).world == world
+    assert photographs_for(path, SceneOptions(data)).world is None
 
 
 def test_a_training_without_a_record_is_compared_as_the_other_one_was_drawn(

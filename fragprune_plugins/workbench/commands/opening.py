@@ -71,7 +71,8 @@ def drawn_as_trained(scene: SceneOptions, *models: Path) -> Photographs:
 def _recorded(model: Path) -> Photographs | None:
     """The photographs in a model's record; of its own pictures, those of the model before."""
     if (record := records.beside(model)) is None:
-        return None
+        known = _of_run(model)
+        return known.photographs if known else None
     if read := records.recorded(record):
         return read.photographs
     return output.trained_on(records.located(str(record.data.get("model")), record.path.parent))
@@ -79,6 +80,11 @@ def _recorded(model: Path) -> Photographs | None:
 
 def as_trained(model: Path) -> tuple[bool, Mapping[str, Any]]:
     """The ``filtered`` and the ``drawing`` of a model, by the record of the run that trained it."""
+    return (known.filtered, known.drawing) if (known := _of_run(model)) else (False, {})
+
+
+def _of_run(model: Path) -> records.Recorded | None:
+    """What the record of the run that trained a model says; None if no folder of its has one."""
     written, folder = model.stat().st_mtime_ns, output.output_folder(model)
     with contextlib.suppress(RecordError):
         found = records.find(folder) if folder else [records.beside(model)]
@@ -87,8 +93,8 @@ def as_trained(model: Path) -> tuple[bool, Mapping[str, Any]]:
             own = read and model.resolve() in [each.resolve() for each in read.models]
             current = path.parent.samefile(model.parent) or path.stat().st_mtime_ns >= written
             if read and own and current:  # else it is of another training
-                return read.filtered, read.drawing
-    return False, {}
+                return read
+    return None
 
 
 def warn_if_antialiased(*models: Path) -> None:
