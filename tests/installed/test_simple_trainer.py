@@ -227,8 +227,12 @@ def test_nor_where_the_script_changed_the_gaussians_since(train, caplog, monkeyp
     assert "other Gaussians than those that train" in caplog.text
 
 
-def test_gaussians_move_in_stage_two_as_in_a_fine_tuning(train, tmp_path):
-    """By the plugin of ``fragprune run``: its stage is another after the look."""
+@pytest.mark.parametrize("sparse", [False, True])
+def test_gaussians_move_in_stage_two_as_in_a_fine_tuning(sparse, train, tmp_path):
+    """By the plugin of ``fragprune run``: its stage is another after the look.
+
+    Sparse gradients have no rows of their own, so nothing moves there.
+    """
     plugins, lively = installed(), Lively()
 
     class Moving(Looked):
@@ -240,10 +244,12 @@ def test_gaussians_move_in_stage_two_as_in_a_fine_tuning(train, tmp_path):
     plugins.register(lively, "lively")
     try:
         settings = Settings(iterations=20, goal=Pressure(1e-3))
-        summary = train(ply=True, look=Moving(), settings=settings)
+        more = ["--sparse_grad"] if sparse else []
+        summary = train(*more, ply=True, look=Moving(), settings=settings)
     finally:
         plugins.remove("lively")
-    assert lively.relocated == len(lively.rows) > 0
+    assert lively.relocated == (0 if sparse else len(lively.rows))
+    assert len(lively.rows) > 0
     assert summary.gaussians == len(load(summary.model_after))
 
 

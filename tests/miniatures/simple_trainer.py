@@ -30,11 +30,12 @@ class Config:
     save_steps: str = "7000 30000"
     ply_steps: str = "7000 30000"
     save_ply: bool = False
+    sparse_grad: bool = False
     viewer: str = ""
     strategy: str = "default"
 
 
-def create_splats_with_optimizers(count: int = 60):
+def create_splats_with_optimizers(sparse_grad: bool, count: int = 60):
     generator = torch.Generator().manual_seed(0)
 
     def spread(*shape):
@@ -51,8 +52,9 @@ def create_splats_with_optimizers(count: int = 60):
     splats = torch.nn.ParameterDict(
         {name: torch.nn.Parameter(value) for name, (value, _) in tensors.items()}
     ).to("cuda:0")
+    kind = torch.optim.SparseAdam if sparse_grad else torch.optim.Adam
     optimizers = {
-        name: torch.optim.Adam([{"params": splats[name], "lr": rate, "name": name}], eps=1e-15)
+        name: kind([{"params": splats[name], "lr": rate, "name": name}], eps=1e-15)
         for name, (_, rate) in tensors.items()
     }
     return splats, optimizers
@@ -66,7 +68,7 @@ class Runner:
         random.seed(42)
         for folder in ("ckpts", "stats", "ply"):
             (self.out / folder).mkdir(parents=True, exist_ok=True)
-        self.splats, self.optimizers = create_splats_with_optimizers()
+        self.splats, self.optimizers = create_splats_with_optimizers(config.sparse_grad)
         kind = MCMCStrategy if config.strategy == "mcmc" else DefaultStrategy
         self.strategy = kind(refine_start_iter=4, refine_every=4, refine_stop_iter=20)
         self.strategy.check_sanity(self.splats, self.optimizers)
@@ -115,6 +117,8 @@ class Runner:
                 export = getattr(gsplat, "export_splats", None)  # 1.4.0 has none
                 if export:
                     export(**self.splats, save_to=f"{self.out}/ply/point_cloud_{step}.ply")
+            for each in self.splats.values() if config.sparse_grad else ():
+                each.grad = each.grad.to_sparse(1)
             for optimizer in self.optimizers.values():
                 optimizer.step()
                 optimizer.zero_grad(set_to_none=True)

@@ -118,7 +118,8 @@ class _Steps:
         rates = {name: LIVELY * self.session.rates[model][name] for name in _NAMES - {"opacity"}}
         rates["xyz"] *= _POSITIONS
         if moving is not None:
-            if not _is_all(model, rows):
+            pull = rows["xyz"].grad
+            if not _is_all(model, rows) or (pull is not None and pull.is_sparse):
                 return {}
             moving = moving.to(self.stage.store.logits.device)
             steps = self.session.settings.iterations
