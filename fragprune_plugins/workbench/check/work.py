@@ -9,6 +9,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
+from tqdm import tqdm
+
 from fragprune_plugins.errors import UnknownHostError
 from fragprune_plugins.hosts.adapter import HostAdapter, ScriptAdapter
 from fragprune_plugins.hosts.choosing import attempt, closest, folder_above, locate, usage
@@ -96,7 +98,7 @@ def _single(
 def _table(hosts: tuple[Path, ...], adapters: list[HostAdapter], plugins: Plugins) -> Report:
     """A row for each checkout."""
     rows = []
-    for each in hosts:
+    for each in tqdm(hosts, "reading", unit="checkout", leave=False, disable=None):
         repo = _repository(each, adapters, None)
         judged = judge(repo, attempt(repo, adapters), adapters, plugins)
         rows.append({"host": each.name, "commit": repo.commit, **judged.as_dict()})
