@@ -42,7 +42,7 @@ ONLY = {
 }
 """Flags with values that stage 2 cannot follow; these values it can."""
 NEAR = 0.01  # the near plane of ``rasterization``
-BESIDE = ("post-processing", "use-bilateral-grid")  # these change colours
+BESIDE = ("post-processing", "use-bilateral-grid", "use-fused-bilagrid")  # these change colours
 OFF = ["None"], ["False"]
 IDENTITY = [[float(row == column) for column in range(4)] for row in range(4)]
 _WHERE = "gsplat's simple_trainer"
