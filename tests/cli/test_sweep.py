@@ -1,5 +1,6 @@
 """fragprune run in front of a script that starts trainings: each one is served."""
 
+import contextlib
 import json
 import os
 import shlex
@@ -211,6 +212,17 @@ def test_scripts_of_hosts_are_served(words, served, tmp_path, monkeypatch):
         started.main(tmp_path, words)
     if not served:
         execv.assert_called_once_with(sys.executable, [sys.executable, *words])
+
+
+@pytest.mark.parametrize("script", [HOST / "render.py", "mine.py"])
+def test_a_hosts_script_is_not_started_with_a_file_of_ours(script, tmp_path, monkeypatch):
+    """gsplat's benchmarks evaluate all files of a folder of checkpoints."""
+    execv = Mock(side_effect=KeyboardInterrupt)
+    monkeypatch.setattr(started.os, "execv", execv)
+    words = [str(script), "--ckpt", "out/ckpts/ckpt_9_rank0.fragprune.safetensors"]
+    with pytest.raises(KeyboardInterrupt) if script == "mine.py" else contextlib.nullcontext():
+        started.main(tmp_path, words)
+    assert sweep._runs(tmp_path) == []
 
 
 def test_a_training_that_fails_leaves_its_exit_code(tmp_path):

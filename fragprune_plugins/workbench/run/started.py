@@ -37,6 +37,9 @@ def main(folder: Path, words: list[str]) -> None:
         if warned.buffer:
             _write(result, done, warned)
         os.execv(sys.executable, [sys.executable, *words])
+    if ours := [word for word in words if ".fragprune." in Path(word).name]:
+        log.info("%s lies beside a model, and is none: left out", ours[0])  # of a glob
+        return
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's & has it ignored
     signal.signal(signal.SIGHUP, signal.SIG_IGN)  # it ends the shells around, not what saves
     options, reports = json.loads((folder / sweep.OPTIONS).read_text()), list[Any]()
