@@ -40,7 +40,7 @@ class Lively:
     Attributes:
         on: whether stage 2 learns at the rates of a fine-tuning.
         rows: (M,) int64, the Gaussians that may move, see ``Relocation``; None for none.
-        views: of the training, on the model's device, to price area in; empty for no price.
+        views: of the training, to price area in; empty for no price.
         loss: () the host's, of the step before; None before the first.
         relocated: Gaussians that have moved.
     """
@@ -144,7 +144,8 @@ class _Steps:
                 rotations=torch.nn.functional.normalize(shapes["rotation"]),
                 colors=rows["f_dc"].detach().reshape(-1, 3),
             )
-            inputs = RasterInputs(of.views[step % len(of.views)], splats, planes=())
+            view = of.views[step % len(of.views)].to(splats.means.device)
+            inputs = RasterInputs(view, splats, planes=())
             torch.autograd.backward(price(of.loss, area_per_pixel(inputs)))
         for name, shape in shapes.items():
             if (grad := rows[name].grad) is not None and shape.grad is not None:
