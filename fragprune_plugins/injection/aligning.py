@@ -64,19 +64,29 @@ def on_rearrange(session: SessionState, call: SeamCall) -> Any:
     return result
 
 
+def held_rows(model: Any, count: int) -> list[tuple[dict[str, Any], str, Tensor]]:
+    """What a model itself holds of this many rows: where, by which name, and the tensor."""
+    places = (vars(model), vars(model).get("_parameters", {}))
+    every = ((held, name, each) for held in places for name, each in held.items())
+    return [
+        (held, name, each)
+        for held, name, each in every
+        if isinstance(each, Tensor) and each.shape[:1] == (count,)
+    ]
+
+
 def keep_rows(session: SessionState, model: Any, kept: Tensor) -> None:
     """Remove the Gaussians but for ``kept``, (N,) bool, between two steps of a training.
 
     Whatever has a row for each keeps a part: parameters, which are new ones, moments, statistics.
     """
     parts: dict[Tensor, Tensor] = {}
-    for held in (vars(model), vars(model).get("_parameters", {})):
-        rows = {k: v for k, v in held.items() if isinstance(v, Tensor) and len(v.shape) > 0}
-        for name, old in rows.items():
-            if len(old) == len(kept):
-                part = old.detach()[kept]
-                trains = isinstance(old, torch.nn.Parameter)
-                held[name] = parts[old] = torch.nn.Parameter(part) if trains else part
+    for held, name, old in held_rows(model, len(kept)):
+        if old not in parts:
+            part, trains = old.detach()[kept], old.requires_grad and old.is_leaf
+            known = isinstance(old, torch.nn.Parameter)
+            parts[old] = torch.nn.Parameter(part, trains) if known else part.requires_grad_(trains)
+        held[name] = parts[old]
     for optimizer in filter(None, (each() for each in session.optimizers[model])):
         for group in optimizer.param_groups:
             group["params"] = [parts.get(each, each) for each in group["params"]]

@@ -16,7 +16,7 @@ from torch import Tensor
 from fragprune_plugins.errors import log
 from fragprune_plugins.hosts.seams import Role, Seam, SeamCall
 from fragprune_plugins.injection import ranks
-from fragprune_plugins.injection.aligning import keep_rows
+from fragprune_plugins.injection.aligning import held_rows, keep_rows
 from fragprune_plugins.injection.state import ModelState, SessionState
 from fragprune_plugins.learning.events import StepStats
 from fragprune_plugins.learning.stage2 import Stage2
@@ -115,9 +115,15 @@ def look_at(session: SessionState, model: Any, state: ModelState, drawn: Any = N
     if session.look is None or state.steps != session.from_step:
         return
     look, session.look = session.look, None
-    late = isinstance(drawn, Tensor)
-    if late or len(session.models) > 1:
-        why = "its host draws without reading a photograph" if late else "several models train"
+    own = {id(each) for _, _, each in held_rows(model, len(state.store))}
+    trained = (each for _, group in session.groups(model) for each in group["params"])
+    strange = any(id(p) not in own for p in trained if p.shape[:1] == (len(state.store),))
+    obstacles = (
+        (isinstance(drawn, Tensor), "its host draws without reading a photograph"),
+        (len(session.models) > 1, "several models train"),
+        (strange, "another object holds what trains of its Gaussians"),
+    )
+    if why := next((why for found, why in obstacles if found), ""):
         log.warning("stage 2 learns as asked, without a look at the model: %s", why)
         return
     session.settings, kept = look(model)

@@ -53,6 +53,18 @@ def test_a_fork_without_checkpoints_is_pruned_in_one_run(fork, photographs, tmp_
 
 
 ENDED = ("--densify_until_iter", 8)
+HELD = """
+
+class _Held:
+    def __set__(self, model, value):
+        vars(model).setdefault("box", [None])[0] = value
+
+    def __get__(self, model, kind=None):
+        return self if model is None else model.box[0]
+
+
+GaussianModel._opacity = _Held()
+"""
 
 
 def every_second(ply, photographs, drawing, settings):
@@ -69,6 +81,19 @@ def test_in_one_run_a_fork_begins_stage_two_with_what_a_look_keeps(fork, photogr
     assert len(read_ply(first)) == summary.gaussians == (whole + 1) // 2
     check_stage_two(replace(summary, model_before=first), "3dgs-fork")
     assert summary.settings["dropout"] == 0.25
+
+
+def test_none_is_looked_at_whose_parameters_another_object_holds(
+    fork, photographs, tmp_path, caplog
+):
+    """They would keep all their rows."""
+    edit(fork / "train_scene.py", "chkpnt", "state")
+    with (fork / "scene/gaussian_model.py").open("a") as source:
+        source.write(HELD)
+    words = runs.command(fork / "train_scene.py", photographs, tmp_path / "out", 12, *ENDED)
+    summary = run(words, replace(OPTIONS, look=every_second))
+    assert "another object holds what trains of its Gaussians" in caplog.text
+    assert summary.gaussians == len(read_ply(summary.model_before))
 
 
 def test_of_several_models_none_is_looked_at(fork, photographs, tmp_path, caplog):
