@@ -204,17 +204,18 @@ class Stages:
 
     def _look(self, resumed: Path, iteration: int) -> tuple[Settings, Path]:
         """What a look at the model of stage 1 gives, and the file to resume with what it keeps."""
-        whole = [resumed]
+        own = self.scratch / "whole" / resumed.name
 
         def ready(before: Path) -> None:
+            nonlocal resumed
             if not starting.holds(resumed, before):
-                whole[0] = self.scratch / "whole" / resumed.name
-                whole[0].parent.mkdir(exist_ok=True)
-                self.adapter.checkpoint_from_ply(before, iteration, whole[0])
+                own.parent.mkdir(exist_ok=True)
+                self.adapter.checkpoint_from_ply(before, iteration, own)
                 log.info("from %s instead: its iteration changed Gaussians after that", before)
+                resumed = own
 
         settings, kept = self._looked(self.before, ready)
-        return settings, starting.part_of(whole[0], kept, self.scratch)
+        return settings, starting.part_of(resumed, kept, self.scratch)
 
     def _look_within(self, iteration: int, model: Any) -> tuple[Settings, Tensor | None]:
         """The same in one run, in which the host trains on."""
