@@ -17,6 +17,7 @@ from fragprune_plugins.learning.stage2 import evenly_spaced
 from fragprune_plugins.workbench.figures.evaluate import Candidate, psnrs
 from fragprune_plugins.workbench.figures.metrics import mean, psnr
 from fragprune_plugins.workbench.scenes.dataset import OFF_CENTRE, Dataset, Shot, load_photographs
+from fragprune_plugins.workbench.scenes.normalised import worlds
 
 OTHER_SCENE = 3.0
 """dB of PSNR that a model has to be above pictures of one colour each, to be one of the scene.
@@ -28,9 +29,10 @@ _EQUAL = 100.0  # dB of PSNR: what is left is rounding
 def matched(model: Model, read: Photographs, engine: Engine) -> tuple[Photographs, Dataset]:
     """Photographs around the middle or the principal point, with or without alpha, as a model shows
     them best: 3DGS and most of its descendants take the middle, whatever the scene says, and drop
-    the alpha of a COLMAP scene's images; others do not.
+    the alpha of a COLMAP scene's images; others do not. Of a model that shows none of them, in the
+    world of gsplat's trainer, if it does there.
     """
-    dataset = load_photographs(replace(read, centred=True))  # nothing is wrong with another point
+    read, dataset = _in_its_world(model, read, engine)
     told = bool(read.centred), read.opaque
     points = (True, False) if dataset.off_centre > OFF_CENTRE else told[:1]
     alphas = (told[1], not told[1]) if dataset.transparent else told[1:]
@@ -48,6 +50,26 @@ def matched(model: Model, read: Photographs, engine: Engine) -> tuple[Photograph
         said = f"{figures[best]:.1f} dB, {figures[others[0]]:.1f} otherwise."
         click.echo(f"MODEL {' and '.join(drawn)}: {said}", err=True)
     return replace(read, centred=best[0], opaque=best[1]), ways[best]
+
+
+def _in_its_world(model: Model, read: Photographs, engine: Engine) -> tuple[Photographs, Dataset]:
+    """The photographs, in another world if the model shows them there alone."""
+    dataset = load_photographs(replace(read, centred=True))  # nothing is wrong with another point
+    shown, plain = shown_and_plain(model, dataset.to(model.device), engine)
+    if read.world is not None or shown >= plain + OTHER_SCENE:
+        return read, dataset
+    others = [
+        (there, load_photographs(there))
+        for there in (replace(read, centred=True, world=each) for each in worlds(read.folder))
+    ]
+    figures = [shown_and_plain(model, each.to(model.device), engine)[0] for _, each in others]
+    best = max(figures, default=shown)
+    if best < plain + OTHER_SCENE:
+        return read, dataset
+    said = "MODEL lies where gsplat's trainer turns and scales a scene to:"
+    click.echo(f"{said} {best:.1f} dB, {shown:.1f} otherwise.", err=True)
+    there, seen = others[figures.index(best)]
+    return replace(read, world=there.world), seen
 
 
 def told_or_matched(model: Model, read: Photographs, engine: Engine) -> tuple[Photographs, Dataset]:

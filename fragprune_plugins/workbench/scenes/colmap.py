@@ -9,7 +9,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -114,6 +116,17 @@ def read(folder: Path, images: str = "images") -> tuple[list[Posed], list[Posed]
     return split(rows)
 
 
+def points(folder: Path) -> NDArray[np.float64]:
+    """(P, 3) the points of a scene; (0, 3) of a folder without any."""
+    model = find_model(folder)
+    files = [model / f"points3D.{kind}" for kind in ("bin", "txt")] if model else []
+    for file in (each for each in files if each.exists()):
+        with _FILE.reading(file) as reading:
+            rows = (_points_binary if file.suffix == ".bin" else _points_text)(reading)
+            return np.array([*rows], dtype=np.float64).reshape(-1, 3)
+    return np.zeros((0, 3))
+
+
 def _mask_path(masks: Path, name: str) -> Path | None:
     """The image's mask, named as COLMAP names it (with .png at the end) or as the image."""
     named = masks / f"{name}.png"
@@ -202,6 +215,20 @@ def _images_binary(reading: Reading) -> Iterator[Pose]:
         name = _name(reading)
         reading.skip(24 * _unpack(reading, "Q")[0])  # 2D points: x, y, id
         yield name, camera_id, tuple(numbers[:4]), tuple(numbers[4:])
+
+
+def _points_text(reading: Reading) -> Iterator[tuple[float, ...]]:
+    for line in _text_lines(reading):
+        if line.strip():
+            yield tuple(float(value) for value in line.split(maxsplit=4)[1:4])
+
+
+def _points_binary(reading: Reading) -> Iterator[tuple[float, ...]]:
+    for _ in _announced(reading, least=51):
+        _number, *xyz = _unpack(reading, "Q3d")
+        reading.skip(11)  # colour, error
+        reading.skip(8 * _unpack(reading, "Q")[0])  # where it was seen: image, 2D point
+        yield tuple(xyz)
 
 
 def _name(reading: Reading) -> str:
