@@ -74,7 +74,8 @@ def reasons(repo: HostRepo, scripts: tuple[str, ...]) -> tuple[str, ...]:
         found += [*_of_cameras(repo, module), *_of_options(repo, module)][:1]
         found += [*_untyped(repo, module)][:1]
         found += [*_unmade(repo, module), *_into_none(repo, module)][:1]
-        found += [f"{script} {why}" for why, asked in _ends(repo, module) if not asked][:1]
+        ends = (why for why, asked in _ends(repo, module) if not asked)
+        found += [f"{script} {why}" for why in (*ends, *_by_another(repo, module))][:1]
         found += [f"{script} draws by {each}" for each in _drawn_elsewhere(repo, module)][:1]
         found += [f"{script} makes {each}" for each in _other_scenes(repo, module)][:1]
     return tuple(found)
@@ -156,23 +157,26 @@ def _drawn_elsewhere(repo: HostRepo, module: str) -> Iterator[str]:
     """
     usual, known = "gaussian_renderer", as_options(repo, ("arguments", module))
     trains = learning(repo.tree(module))
-    called = {
-        each.func.id for f in trains for each in every(f, ast.Call) if hasattr(each.func, "id")
-    }
+    calls = (n for f in trains for n in {*every(f, ast.Call)} - skipped(f, known).keys())
+    called = {n.func.id for n in calls if isinstance(n.func, ast.Name)}
     for each in getattr(repo.tree(module), "body", ()) if repo.tree(usual) else ():
         if (getattr(each, "name", "") in called or each in trains) and _RASTERIZES in text_of(each):
             yield f"{each.name} of its own, not of {usual}"
     for node in every(repo.tree(module), ast.ImportFrom):
         beside = repo.absolute(module, node)
-        for body in (repo.function(usual, each.name) for each in node.names if beside == usual):
+        drawing = [each for each in node.names if beside == usual]
+        names = [each.name for each in drawing if (each.asname or each.name) in called]
+        for body in (repo.function(usual, each.name) for each in drawing):
             gone = skipped(body, known)
-            for made in (each for each in every(body, ast.Return) if each not in gone):
-                name = getattr(getattr(made.value, "func", None), "id", "")
-                other, given = repo.function(usual, name), repo.parameters(usual, name) or ()
-                shown = [text_of(each).split(".clamp(")[0] for each in entries(other, "render")]
-                alone = "GaussianRasteriz" not in text_of(other)
-                if alone and any(each not in given for each in shown):  # or it was drawn before
-                    yield f"{name}, which calls no rasterizer of 3DGS"
+            returned = (each.value for each in every(body, ast.Return) if each not in gone)
+            names += [getattr(getattr(each, "func", None), "id", "") for each in returned]
+        for name in names:
+            other, given = repo.function(usual, name), repo.parameters(usual, name) or ()
+            shown = [text_of(each).split(".clamp(")[0] for each in entries(other, "render")]
+            uses = (repo.function(usual, each.id) for each in every(other, ast.Name))
+            alone = not any("GaussianRasteriz" in text_of(each) for each in (other, *uses))
+            if alone and any(each not in given for each in shown):  # or it was drawn before
+                yield f"{name}, which calls no rasterizer of 3DGS"
         for each in node.names if beside != usual else ():
             home, found = definition_of(repo, beside, each.name)
             own = definition_of(repo, usual, each.name)[0]
@@ -558,6 +562,30 @@ def _ends(repo: HostRepo, module: str) -> list[tuple[str, frozenset[str]]]:
             off = {name for name in read if not by_default_of(repo, modules, name)[0]}
             place = f"{text_of(tests[-1])[:60]} ({repo.at(module, node.lineno)})"
             found.append((f"may end before its last iteration, where {place}", frozenset(off)))
+    return found
+
+
+def _by_another(repo: HostRepo, module: str) -> Iterator[str]:
+    """Options that say how long a script trains in the place of ``--iterations``."""
+    named = named_once(repo.tree(module))
+    for function in learning(repo.tree(module)):
+        both: tuple[Any, ...] = every(function, ast.For, ast.While)
+        loops = sorted((e for e in both if "backward(" in text_of(e)), key=lambda e: e.lineno)
+        heads: list[Any] = [e.iter if isinstance(e, ast.For) else e.test for e in loops]
+        ends = heads[0].args[:2][-1:] if loops and text_of(heads[0]).startswith("range(") else []
+        read = (n.attr for e in _spelled(ends, named) for n in every(e, ast.Attribute))
+        known = [name for name in read if by_default_of(repo, ("arguments", module), name)]
+        if known and not any("iterations" in text_of(each) for each in _spelled(heads, named)):
+            at = repo.at(module, loops[0].lineno)
+            yield f"trains as long as --{known[0]} says, not --iterations ({at})"
+
+
+def _spelled(parts: Iterable[ast.AST], named: Mapping[str, ast.AST]) -> list[ast.AST]:
+    """Code and what its names stand for."""
+    found = [*parts]
+    for each in found:  # it grows
+        values = (named[n.id] for n in every(each, ast.Name) if n.id in named)
+        found += [value for value in values if value not in found]
     return found
 
 

@@ -1396,6 +1396,34 @@ def test_a_function_without_a_rasterizer_draws_in_the_place_of_no_other(tmp_path
 
 
 @pytest.mark.parametrize(
+    ("end", "given"),
+    [
+        ("args.steps + 1", ""),
+        ("steps", "    steps = args.steps\n"),
+        ("steps", "    steps = opt.iterations if opt.iterations else args.steps\n"),
+        ("args.steps + opt.iterations", ""),
+        ("args.unknown", ""),
+    ],
+)
+def test_a_training_is_as_long_as_the_option_of_its_length_says(tmp_path, end, given):
+    loop = LOOP, f"{given}    for iteration in range(1, {end}):\n"
+    flags = PARSES, f"\nparser.add_argument('--steps', type=int, default=7)\n{PARSES}"
+    found = why(tmp_path, loop, flags)
+    said = "train.py trains as long as --steps says, not --iterations (train.py:"
+    assert (said in found) == ("steps" in end + given and "iterations" not in end + given)
+
+
+@pytest.mark.parametrize("draws", ["backend(pc)", "settings(GaussianRasterizer)", "made(pc)"])
+def test_a_function_that_is_imported_under_the_usual_name_draws_by_a_rasterizer(tmp_path, draws):
+    other = f"def quick(cam, pc, p, b):\n    image = {draws}\n    return {{'render': image}}\n"
+    other += "def made(pc):\n    return GaussianRasterizer(pc)\n"
+    quick = "from gaussian_renderer import render", "from gaussian_renderer import quick as render"
+    found = why(tmp_path, quick, files={RENDERER: other})
+    said = "draws by quick, which calls no rasterizer of 3DGS"
+    assert (said in found) == (draws == "backend(pc)")
+
+
+@pytest.mark.parametrize(
     ("name", "text", "said"),
     [
         ("helpers", "def f():\n", "imports helpers, which is no valid Python (scene/tools.py:1)"),
