@@ -28,6 +28,8 @@ _CHANGES = re.compile(
     re.IGNORECASE,
 )
 """Statements by which a camera changes its photograph, or the angles that it was taken with."""
+_RECOLOURS = re.compile(r"gamma|linear|rgb_to|cctf|tone_?map|\bpow(er)?$", re.IGNORECASE)
+"""In names of functions that give a photograph other colours."""
 _POSES = re.compile(
     r"\{'params': .*'name': (f?'(?:pose|cam(?:era)?s?)(?:_\w*)?\W.*)\}"
     r"|\{'params': \[?((?:view\w*|cam\w*)\.\w+)\W.*\}"
@@ -52,11 +54,19 @@ def unlike(repo: HostRepo, scripts: Iterable[str]) -> str:
 
 def _of_cameras(repo: HostRepo) -> Iterator[str]:
     """How cameras change their photographs, or the angles that these were taken with."""
-    module = "scene.cameras"
-    for each in every(repo.tree(module), ast.stmt):
-        if _CHANGES.match(text_of(each)):
-            at = repo.at(module, each.lineno)
-            yield f"its cameras change what they see, {text_of(each)[:60]} ({at})"
+    found: list[tuple[str, ast.AST]] = []
+    for node in every(repo.tree("scene.cameras"), ast.stmt):
+        found += [("scene.cameras", node)] * bool(_CHANGES.match(text_of(node)))
+    for module, name in (("utils.general_utils", "PILtoTorch"), ("utils.camera_utils", "loadCam")):
+        for call in every(repo.function(module, name), ast.Call):
+            found += [(module, call)] * bool(_RECOLOURS.search(text_of(call.func)))
+    for asked in every(repo.tree("scene.dataset_readers"), ast.If):
+        texts = (getattr(each, "value", 0) for each in getattr(asked.test, "values", ()))
+        if any(isinstance(each, str) for each in texts):  # it is true of any camera's model
+            found.append(("scene.dataset_readers", asked.test))
+    for module, what in found:
+        at = repo.at(module, getattr(what, "lineno", 0))
+        yield f"its cameras change what they see, {text_of(what)[:60]} ({at})"
 
 
 def _of_script(repo: HostRepo, script: str) -> Iterator[str]:

@@ -109,6 +109,25 @@ def test_a_camera_may_change_what_it_sees(tmp_path, change):
 
 
 @pytest.mark.parametrize(
+    ("file", "text", "changes"),
+    [
+        ("utils/general_utils", "def PILtoTorch(a):\n    return colour.RGB_to_RGB(a)", True),
+        ("utils/general_utils", "def PILtoTorch(a):\n    return torch.pow(a, 2.2)", True),
+        ("utils/general_utils", "def PILtoTorch(a):\n    return a.resize(3).permute(2)", False),
+        ("utils/camera_utils", "def loadCam(a):\n    return to_linear(PILtoTorch(a))", True),
+        ("utils/camera_utils", "def other(a):\n    return to_linear(PILtoTorch(a))", False),
+        ("scene/dataset_readers", "if model == 'SIMPLE' or 'RADIAL': one()", True),
+        ("scene/dataset_readers", "if model == 'SIMPLE' or model == 'RADIAL': one()", False),
+        ("scene/dataset_readers", "folder = images or 'images'", False),
+    ],
+)
+def test_readers_may_change_what_a_camera_sees(tmp_path, file, text, changes):
+    (tmp_path / file).parent.mkdir()
+    (tmp_path / f"{file}.py").write_text(text)
+    assert why(tmp_path).startswith("its cameras change what they see") == changes
+
+
+@pytest.mark.parametrize(
     "group",
     [
         *(
