@@ -227,8 +227,13 @@ class Stages:
                 found, expected = "other Gaussians than those that train", "a PLY of the same"
                 raise NotComparedError(str(before), found, expected, "")
 
-        with torch.random.fork_rng([means.device] if means.is_cuda else []), directly(means.device):
+        # torch's fork_rng would remember, for the whole process, that a host's cuda is the CPU.
+        numbers = torch.cuda if means.is_cuda else torch
+        states = torch.get_rng_state(), numbers.get_rng_state()
+        with directly(means.device):
             self.settings, kept = self._looked(self._model(iteration), ready)
+        torch.set_rng_state(states[0])
+        numbers.set_rng_state(states[1])
         return self.settings, kept if kept is None else kept.to(means.device)
 
     def _looked(

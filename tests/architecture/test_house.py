@@ -25,7 +25,7 @@ LAZY = (  # by name: in adapting.__getattr__, in engines.ENGINES
 
 # figure: (bound, goal)
 BOUNDS = {
-    "core lines": (11_029, 12_000),
+    "core lines": (11_034, 12_000),
     "core imports of the workbench": (0, 0),
     "imports inside functions": (27, 60),
     "functions over 60 lines": (4, 10),

@@ -204,6 +204,8 @@ def test_a_look_leaves_the_trainings_random_numbers_alone(train, tmp_path):
         train("--result_dir", tmp_path / str(number), ply=True, look=look)
         found.append(load(tmp_path / str(number) / f"ply/point_cloud_{TOTAL + MORE - 1}.ply"))
     assert torch.equal(found[0].xyz, found[1].xyz)
+    if known := getattr(torch, "get_device_module", None):  # it remembers what it once answered
+        assert known("cuda") is torch.cuda
 
 
 def test_without_a_ply_there_is_no_look_and_that_is_said(train, caplog):
