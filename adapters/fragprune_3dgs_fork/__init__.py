@@ -382,18 +382,9 @@ class ForkAdapter(GraphdecoAdapter):
         saved = map(str, sorted({first, last, *stated}))
         return [*arguments, "--iterations", str(last), "--save_iterations", *saved]
 
-    def trainer(self, repo: HostRepo, script: Path) -> ForkAdapter:
-        """This adapter.
-
-        Raises:
-            UsageError: the script trains and is not served.
-        """
-        fork = read_fork(repo)
-        for name, why in fork.unserved.items():
-            if script.resolve() == (repo.root / name).resolve():
-                served = f"a script that is served: {', '.join(fork.scripts)}"
-                raise UsageError(name, why, served, "Prune its PLY: fragprune finetune.")
-        return self
+    def unserved(self, repo: HostRepo) -> dict[str, str]:
+        """Those that were read."""
+        return read_fork(repo).unserved
 
     def options(self, repo: HostRepo) -> frozenset[str]:
         """Those that were read."""

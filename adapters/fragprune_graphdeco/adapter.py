@@ -321,7 +321,31 @@ class GraphdecoAdapter(ScriptAdapter):
             *self._groups(repo),
             *self._calls(repo),
             *self._drawn(repo),
+            *(
+                Finding("warning", "script", name, f"{name}, which is not served: {why}")
+                for name, why in self.unserved(repo).items()
+            ),
         ]
+
+    def unserved(self, repo: HostRepo) -> dict[str, str]:
+        """Scripts of a checkout that train and are not served, with the reason for each."""
+        trains = () if self.installed else reading.training_scripts(repo)
+        others = [each for each in trains if each not in self.command_line(repo).scripts]
+        return dict.fromkeys(others, f"{self.info.title} has no such script")
+
+    def trainer(self, repo: HostRepo, script: Path) -> GraphdecoAdapter:
+        """This adapter.
+
+        Raises:
+            UsageError: the script trains and is not served.
+        """
+        others = self.unserved(repo)
+        for name, why in others.items():
+            if script.resolve() == (repo.root / name).resolve():
+                usual = (each for each in self.command_line(repo).scripts if each not in others)
+                served = f"a script that is served: {', '.join(usual)}"
+                raise UsageError(name, why, served, "Prune its PLY: fragprune finetune.")
+        return self
 
     def _optimizers(self, repo: HostRepo, script: str) -> Iterator[tuple[str, frozenset[str]]]:
         """Further optimizers that a script makes, and the options, if any, that ask for each."""

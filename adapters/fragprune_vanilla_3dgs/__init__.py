@@ -93,9 +93,10 @@ class Vanilla3DGS(GraphdecoAdapter):
 
     def fingerprint(self, repo: HostRepo) -> list[Finding]:
         """Check the source, as of a fork too; a finding names the revision."""
-        further = super().fingerprint(repo) or self._further(repo)
-        stopped = any(each.level == "error" for each in further)
-        return further if stopped else [*further, self._state(repo)]
+        found = super().fingerprint(repo)
+        for further in (self._further, self._state):
+            found += [] if any(each.level == "error" for each in found) else further(repo)
+        return found
 
     def _further(self, repo: HostRepo) -> list[Finding]:
         """What a fork of this interface does otherwise: ``3dgs-fork`` serves it, or nobody does."""
@@ -121,17 +122,17 @@ class Vanilla3DGS(GraphdecoAdapter):
         """Those of a fork that was read, but for the optimizer, which is known."""
         return (super().options(repo) | read_fork(repo).options) - {"optimizer_type"}
 
-    def _state(self, repo: HostRepo) -> Finding:
+    def _state(self, repo: HostRepo) -> list[Finding]:
         """A finding that names the revision; an error if it has no checkpoints."""
         names = ("training_setup", "capture", "restore")
         there = [name for name in names if repo.function(graphdeco.MODEL, f"GaussianModel.{name}")]
         if there != ["training_setup"]:
-            return Finding("info", "revision", str(repo.root), self.revision(repo))
+            return [Finding("info", "revision", str(repo.root), self.revision(repo))]
         at = repo.place(graphdeco.MODEL, "GaussianModel")
         found = "neither capture nor restore, as vanilla 3DGS was until 14 July 2023"
         remedy = "Bring the fork to a later state, or give its PLY to fragprune finetune."
         expected = "checkpoints, which stage 2 resumes"
-        return Finding.error("revision", at, found, expected, remedy)
+        return [Finding.error("revision", at, found, expected, remedy)]
 
     def revision(self, repo: HostRepo) -> str:
         """The public state of the source."""

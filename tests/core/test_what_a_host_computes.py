@@ -192,6 +192,23 @@ def test_a_form_multiplied_out_fits_and_is_named(tmp_path):
     findings = Vanilla3DGS().match(skeleton(tmp_path)).findings
     assert [f.level for f in findings if f.code == "kernel"] == ["warning"]
     assert Vanilla3DGS().match(skeleton(tmp_path)).fits
+    (tmp_path / "train_more.py").write_text(MORE)  # it is read as a fork all the same
+    assert not Vanilla3DGS().match(HostRepo(tmp_path)).fits
+
+
+MORE = "gaussians.training_setup(opt)\nloss.backward()\n"
+
+
+def test_a_further_training_script_of_a_named_host_is_not_served(tmp_path):
+    repo, adapter = skeleton(tmp_path), SurfelSplatting()
+    (tmp_path / "train_more.py").write_text(MORE)
+    (tmp_path / "render_more.py").write_text("loss.backward()\n")
+    assert adapter.trainer(repo, tmp_path / "train.py") is adapter
+    assert adapter.trainer(repo, tmp_path / "render_more.py") is adapter
+    with pytest.raises(UsageError, match=r"train_more\.py"):
+        adapter.trainer(repo, tmp_path / "train_more.py")
+    said = [each.found for each in adapter.match(repo).findings if each.level == "warning"]
+    assert said == [f"train_more.py, which is not served: {adapter.info.title} has no such script"]
 
 
 def test_every_rasterizer_of_the_name_counts(tmp_path):
