@@ -15,8 +15,10 @@ from fragprune_plugins.hosts.photographs import Photographs
 from fragprune_plugins.plugins.hooks import engine_for
 from fragprune_plugins.workbench.figures import matching
 from fragprune_plugins.workbench.models.formats.ply import write_ply
-from fragprune_plugins.workbench.scenes.dataset import read_scene
+from fragprune_plugins.workbench.scenes import normalised
+from fragprune_plugins.workbench.scenes.dataset import load_photographs
 from fragprune_plugins.workbench.scenes.normalised import worlds
+from fragprune_plugins.workbench.scenes.posed import Posed
 
 AXES = torch.tensor([1.0, 0.6, 0.3])  # of different sizes, so that their order is known
 
@@ -121,9 +123,21 @@ def test_without_points_nobody_knows_where(scene):
     assert worlds(Path("nowhere")) == []
 
 
-def test_points_in_one_place_have_no_axes(scene):
-    """Their world is one like any other, or none; nothing is divided by zero."""
-    write_points(scene, torch.ones(9, 3), binary=(scene / "sparse/0/points3D.bin").exists())
-    cameras = sum(map(len, read_scene(scene)))
-    assert cameras == 9
-    assert all(np.isfinite(each).all() for each in worlds(scene))
+@pytest.mark.parametrize("place", [float("nan"), float("inf"), 1e300, -1e20, 7.0])
+def test_points_that_are_nowhere_or_in_one_place_end_nothing(place, scene):
+    """The file may be anybody's. Cameras refuse a world that is none."""
+    points = torch.ones(9, 3).double() * place
+    write_points(scene, points, binary=(scene / "sparse/0/points3D.bin").exists())
+    found = worlds(scene)
+    assert len(found) == (4 if place == 7 else 0)
+    for world in found:
+        load_photographs(Photographs(scene, world=world))
+
+
+def test_cameras_in_one_place_have_no_such_world(model, tmp_path, monkeypatch):
+    """Those of a panorama: nothing is divided by zero, and nothing fails."""
+    rows = [replace(each, translation=torch.zeros(3).double()) for each in tiny.cameras()]
+    posed = [Posed(f"{i}", each, Path(f"{i}"), None, None) for i, each in enumerate(rows)]
+    monkeypatch.setattr(normalised, "read_scene", lambda *_, **__: (posed, []))
+    monkeypatch.setattr(normalised.colmap, "points", lambda _: model.xyz.double().numpy())
+    assert worlds(tmp_path) == []

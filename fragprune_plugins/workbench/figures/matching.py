@@ -55,12 +55,16 @@ def matched(model: Model, read: Photographs, engine: Engine) -> tuple[Photograph
 def _in_its_world(model: Model, read: Photographs, engine: Engine) -> tuple[Photographs, Dataset]:
     """The photographs, in another world if the model shows them there alone."""
     dataset = load_photographs(replace(read, centred=True))  # nothing is wrong with another point
+    if read.world is not None:
+        return read, dataset
     shown, plain = shown_and_plain(model, dataset.to(model.device), engine)
-    if read.world is not None or shown >= plain + OTHER_SCENE:
+    if shown >= plain + OTHER_SCENE:
         return read, dataset
     others = [
         (there, load_photographs(there))
-        for there in (replace(read, centred=True, world=each) for each in worlds(read.folder))
+        for there in (
+            replace(read, centred=True, world=each) for each in worlds(read.folder, read.images)
+        )
     ]
     figures = [shown_and_plain(model, each.to(model.device), engine)[0] for _, each in others]
     best = max(figures, default=shown)

@@ -284,7 +284,7 @@ def load_dataset(
         centred: render as if each principal point was the middle of its picture, as 3DGS does. None
             does not, but warns where it makes a difference.
         opaque: drop alpha channels, as 3DGS does of a COLMAP folder's images.
-        world: see ``Photographs``.
+        world: takes the scene's world into that of the models: four rows of four, a similarity.
 
     Raises:
         DatasetError: the folder has neither layout or both, an image is missing, a camera model is

@@ -5,6 +5,7 @@ Its models lie there by default, and their PLYs do not say so.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from fragprune_plugins.hosts.photographs import Similarity
 from fragprune_plugins.workbench.scenes import colmap
 from fragprune_plugins.workbench.scenes.dataset import read_scene
-from fragprune_plugins.workbench.scenes.pinhole import Camera
+from fragprune_plugins.workbench.scenes.pinhole import DISTANCE_MAX, Camera
 
 Matrix = NDArray[np.float64]
 _UP = np.array([0.0, -1.0, 0.0])
@@ -22,20 +23,23 @@ _FEWEST = 4  # points that have principal axes
 _SIGNS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))  # of axes; none mirrors
 
 
-def worlds(folder: Path) -> list[Similarity]:
+def worlds(folder: Path, images: str = "images") -> list[Similarity]:
     """Where a scene may lie then: ``Photographs.world``, four, because axes have no sign.
 
-    None of a folder that is no COLMAP scene with points, or where these are of no extent.
+    None of a folder that is no COLMAP scene with points, nor where cameras are all in one place or
+    points nowhere.
     """
     points = colmap.points(folder)
     if len(points) < _FEWEST:
         return []
-    upright = _upright([row.camera for part in read_scene(folder, split=False) for row in part])
-    along = _along_axes(points @ upright[:3, :3].T + upright[:3, 3])
-    found = [np.diag([*signs, 1.0]) @ along @ upright for signs in _SIGNS]
-    if not np.isfinite(found).all():
-        return []
-    return [tuple(tuple(row) for row in each.tolist()) for each in found]
+    parts = read_scene(folder, images, split=False)
+    with np.errstate(all="ignore"), contextlib.suppress(np.linalg.LinAlgError):
+        upright = _upright([row.camera for part in parts for row in part])
+        along = _along_axes(points @ upright[:3, :3].T + upright[:3, 3])
+        found = [np.diag([*signs, 1.0]) @ along @ upright for signs in _SIGNS]
+        if np.abs(found).max() < DISTANCE_MAX:  # False for NaN, too
+            return [tuple(tuple(row) for row in each.tolist()) for each in found]
+    return []
 
 
 def _upright(cameras: Sequence[Camera]) -> Matrix:

@@ -28,6 +28,7 @@ from fragprune_plugins.workbench.report import work as report
 from fragprune_plugins.workbench.scenes import colmap
 from fragprune_plugins.workbench.scenes.cameras import load_cameras
 from fragprune_plugins.workbench.scenes.dataset import Photograph
+from fragprune_plugins.workbench.scenes.normalised import worlds
 from fragprune_plugins.workbench.scenes.output import trained_on
 from fragprune_vanilla_3dgs import Vanilla3DGS
 
@@ -121,6 +122,22 @@ def _colmap(name: str) -> Callable[[Path], None]:
         for part in colmap.read(file.parent):
             for row in part:
                 _plausible(row.camera.view())
+
+    return read
+
+
+def _points(name: str) -> Callable[[Path], None]:
+    """The points of a COLMAP model, whose cameras have a place in the worlds that these give."""
+
+    def read(file: Path) -> None:
+        sparse = file.parent / "sparse"
+        sparse.mkdir(exist_ok=True)
+        for partner in ("cameras.bin", "images.bin"):
+            (sparse / partner).write_bytes(seeds.good()[partner]["a.bin"])
+        file.replace(sparse / name)
+        for world in worlds(file.parent):
+            for row in colmap.read(file.parent)[0]:
+                _plausible(row.camera.moved(torch.tensor(world, dtype=torch.float64)).view())
 
     return read
 
@@ -229,6 +246,7 @@ READERS = [
     Reader("sidecar", _sidecar),
     *(Reader(name, _colmap(name)) for name in ("cameras.bin", "images.bin")),
     *(Reader(name, _colmap(name)) for name in ("cameras.txt", "images.txt")),
+    *(Reader(name, _points(name)) for name in ("points3D.bin", "points3D.txt")),
     Reader("transforms", _views),
     Reader("cameras.json", _views),
     Reader("record", _record),

@@ -203,6 +203,15 @@ def _camera_path() -> bytes:
     return json.dumps({"camera_path": path, "render_width": 32, "render_height": 32}).encode()
 
 
+_POINTS = [(0.0, 1.0, 0.5), (1.0, 0.0, 0.2), (2.0, 2.0, 0.1), (-1.0, 0.5, 0.9), (0.3, -2.0, 0.4)]
+_TEXT = "".join(f"{i} {x} {y} {z} 1 2 3 0.5\n" for i, (x, y, z) in enumerate(_POINTS)).encode()
+
+
+def _row(point: tuple[float, ...]) -> bytes:
+    """A point of COLMAP's that one image saw."""
+    return struct.pack("<Q3d3BdQii", 1, *point, 1, 2, 3, 0.5, 1, 1, 2)
+
+
 @cache
 def good() -> dict[str, dict[str, bytes]]:
     """Files by reader and name; the same whenever they are made."""
@@ -222,6 +231,10 @@ def good() -> dict[str, dict[str, bytes]]:
             "sidecar": {"a.safetensors": _sidecar(folder)},
             "cameras.bin": {"a.bin": binary["cameras.bin"]},
             "images.bin": {"a.bin": binary["images.bin"]},
+            "points3D.bin": {
+                "a.bin": b"".join([struct.pack("<Q", len(_POINTS)), *map(_row, _POINTS)])
+            },
+            "points3D.txt": {"a.txt": _TEXT},
             "cameras.txt": {"a.txt": text["cameras.txt"], "lenses.txt": _LENSES},
             "images.txt": {"a.txt": text["images.txt"]},
             "transforms": {
