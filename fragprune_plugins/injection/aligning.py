@@ -66,7 +66,7 @@ def on_rearrange(session: SessionState, call: SeamCall) -> Any:
 
 def held_rows(model: Any, count: int) -> list[tuple[dict[str, Any], str, Tensor]]:
     """What a model itself holds of this many rows: where, by which name, and the tensor."""
-    places = (vars(model), vars(model).get("_parameters", {}))
+    places = [vars(model), *(vars(model).get(k, {}) for k in ("_parameters", "_buffers"))]
     every = ((held, name, each) for held in places for name, each in held.items())
     return [
         (held, name, each)

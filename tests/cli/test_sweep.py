@@ -214,15 +214,21 @@ def test_scripts_of_hosts_are_served(words, served, tmp_path, monkeypatch):
         execv.assert_called_once_with(sys.executable, [sys.executable, *words])
 
 
+@pytest.mark.parametrize("beside", [True, False])
 @pytest.mark.parametrize("script", [HOST / "render.py", "mine.py"])
-def test_a_hosts_script_is_not_started_with_a_file_of_ours(script, tmp_path, monkeypatch):
-    """gsplat's benchmarks evaluate all files of a folder of checkpoints."""
+def test_a_hosts_script_is_not_started_with_a_file_of_ours(script, beside, tmp_path, monkeypatch):
+    """gsplat's benchmarks evaluate all of a folder of checkpoints. A folder may be named so."""
     execv = Mock(side_effect=KeyboardInterrupt)
     monkeypatch.setattr(started.os, "execv", execv)
-    words = [str(script), "--ckpt", "out/ckpts/ckpt_9_rank0.fragprune.safetensors"]
-    with pytest.raises(KeyboardInterrupt) if script == "mine.py" else contextlib.nullcontext():
-        started.main(tmp_path, words)
-    assert sweep._runs(tmp_path) == []
+    (tmp_path / OPTIONS).write_text("[]")
+    (tmp_path / STOPPED).touch()  # what is served does not start any more
+    named = tmp_path / "ckpt_9_rank0.fragprune.safetensors"
+    named.touch() if beside else named.mkdir()
+    ends = SystemExit if script != "mine.py" else KeyboardInterrupt
+    left_out = beside and script != "mine.py"
+    with contextlib.nullcontext() if left_out else pytest.raises(ends):
+        started.main(tmp_path, [str(script), "--ckpt", str(named)])
+    assert len(sweep._runs(tmp_path)) == (script != "mine.py" and not left_out)
 
 
 def test_a_training_that_fails_leaves_its_exit_code(tmp_path):

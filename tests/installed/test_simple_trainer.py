@@ -20,6 +20,7 @@ from fragprune_plugins.errors import EngineError, NotComparedError, SidecarError
 from fragprune_plugins.files import sidecar
 from fragprune_plugins.injection import starting, stepping
 from fragprune_plugins.injection.launch import RunOptions, run
+from fragprune_plugins.learning.stage2 import Stage2
 from fragprune_plugins.plugins.loading import installed
 from fragprune_plugins.workbench.models.model import load
 from fragprune_plugins.workbench.run.lively import Lively
@@ -178,8 +179,15 @@ class Looked:
         return replace(settings, dropout=0.25), torch.arange(len(self.model)) % 2 == 0
 
 
-def test_stage_two_begins_with_what_a_look_between_the_stages_keeps(train, tmp_path):
+def test_stage_two_begins_with_what_a_look_between_the_stages_keeps(train, tmp_path, monkeypatch):
     look, out = Looked(), tmp_path / "out"
+    dropped, learned_with = Stage2.dropped, set()
+
+    def noted(stage, inputs):
+        learned_with.add(stage.settings.dropout)
+        return dropped(stage, inputs)
+
+    monkeypatch.setattr(Stage2, "dropped", noted)
     summary = train(ply=True, look=look, settings=Settings(iterations=MORE, train="opacity"))
     assert look.photographs == summary.photographs
     first, last = (load(out / f"ply/point_cloud_{at - 1}.ply") for at in (TOTAL, TOTAL + MORE))
@@ -191,6 +199,7 @@ def test_stage_two_begins_with_what_a_look_between_the_stages_keeps(train, tmp_p
     assert (last.xyz - first.xyz[::2]).abs().max() <= step
     assert summary.settings["dropout"] == sidecar.load(summary.model_after)[1].settings["dropout"]
     assert (summary.settings["dropout"], summary.steps) == (0.25, MORE)
+    assert learned_with == {0.25}
 
 
 def test_a_look_leaves_the_trainings_random_numbers_alone(train, tmp_path):

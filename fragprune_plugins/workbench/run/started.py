@@ -37,7 +37,8 @@ def main(folder: Path, words: list[str]) -> None:
         if warned.buffer:
             _write(result, done, warned)
         os.execv(sys.executable, [sys.executable, *words])
-    if ours := [word for word in words if ".fragprune." in Path(word).name]:
+    paths = (Path(word) for word in words)
+    if ours := [path for path in paths if ".fragprune." in path.name and path.is_file()]:
         log.info("%s lies beside a model, and is none: left out", ours[0])  # of a glob
         return
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's & has it ignored
